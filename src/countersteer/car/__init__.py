@@ -1,0 +1,1 @@
+"""The car: its parameters, each declared once, and the files that hold them."""

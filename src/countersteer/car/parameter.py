@@ -1,0 +1,120 @@
+"""One declaration for each number of a car: unit, range, meaning, default and its source.
+
+TOML keys, command-line overrides, bounds of fits and randomisation all derive from it.
+"""
+
+import dataclasses
+import difflib
+import math
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import jax
+
+from countersteer.errors import InputError
+
+Scalar: TypeAlias = jax.Array | float
+T = typing.TypeVar("T")
+
+# Unit inside -> (suffix of the name at every edge, what one unit outside is inside).
+EDGE = {
+    "1": ("", 1.0),
+    "m": ("_m", 1.0),
+    "s": ("_s", 1.0),
+    "kg": ("_kg", 1.0),
+    "kg m2": ("_kgm2", 1.0),
+    "rad": ("_deg", math.pi / 180),
+    "rad/s": ("_degps", math.pi / 180),
+    "rad/s2": ("_degps2", math.pi / 180),
+    "m/s": ("_mps", 1.0),
+    "m/s2": ("_mps2", 1.0),
+    "N m": ("_nm", 1.0),
+    "N m s": ("_nms", 1.0),
+    "N m/A": ("_nmpa", 1.0),
+    "ohm": ("_ohm", 1.0),
+    "A": ("_a", 1.0),
+    "C": ("_ah", 3600.0),
+    "V": ("_v", 1.0),
+    "Hz": ("_hz", 1.0),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Declaration:
+    """What is known about a parameter: `low` and `high` in the unit used inside."""
+
+    unit: str
+    low: float
+    high: float
+    meaning: str
+    source: str
+    choices: tuple[str, ...] = ()
+
+
+def parameter(
+    default: float, unit: str, low: float, high: float, meaning: str, source: str = "assumed"
+) -> Any:
+    """Declare a number: default and range in the unit that files use (degrees, not radians)."""
+    factor = EDGE[unit][1]
+    declared = Declaration(unit, low * factor, high * factor, meaning, source)
+    return dataclasses.field(default=default * factor, metadata={"declared": declared})
+
+
+def choice(default: str, choices: tuple[str, ...], meaning: str, source: str = "assumed") -> Any:
+    """Declare a setting with a name for a value; it is static under `jit`."""
+    declared = Declaration("1", 0.0, 0.0, meaning, source, choices)
+    return dataclasses.field(default=default, metadata={"declared": declared, "static": True})
+
+
+@typing.dataclass_transform(frozen_default=True, kw_only_default=True)
+def pytree(cls: type[T]) -> type[T]:
+    """Make a class a frozen dataclass and a pytree; fields with `static` are not leaves."""
+    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    static = [f.name for f in dataclasses.fields(cls) if f.metadata.get("static")]
+    data = [f.name for f in dataclasses.fields(cls) if f.name not in static]
+    return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static)
+
+
+
+def declarations(part: type) -> dict[str, tuple[str, Declaration]]:
+    """Key in files -> (field's name, declaration), in the order of declaration."""
+    return {
+        field.name + EDGE[field.metadata["declared"].unit][0]: (
+            field.name,
+            field.metadata["declared"],
+        )
+        for field in dataclasses.fields(part)
+        if "declared" in field.metadata
+    }
+
+
+def read_value(where: str, key: str, declared: Declaration, value: Any) -> Any:
+    """A value from a file or the command line, checked and in the unit used inside.
+
+    Raises `InputError` with the place, the key and the range.
+    """
+    if declared.choices:
+        if value not in declared.choices:
+            raise InputError(f"{where}: {key} must be one of {', '.join(declared.choices)}")
+        return value
+    suffix, factor = EDGE[declared.unit]
+    low, high = declared.low / factor, declared.high / factor
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{where}: {key} must be a number in [{low:g}, {high:g}], not {value!r}")
+    slack = 1e-12 * max(abs(low), abs(high))  # a bound survives the round trip through degrees
+    if not low - slack <= value <= high + slack:  # false for NaN too
+        raise InputError(f"{where}: {key} = {value:g} is outside its range [{low:g}, {high:g}]")
+    return float(value) * factor
+
+
+def write_value(declared: Declaration, value: Any) -> Any:
+    """The inverse of `read_value`, for files."""
+    return value if declared.choices else float(value) / EDGE[declared.unit][1]
+
+
+def unknown_key(where: str, key: str, known: Mapping[str, Any]) -> InputError:
+    """The error for a key that nothing declares, with the nearest ones that something does."""
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
+    return InputError(f"{where}: unknown key {key}{hint}")

@@ -1,0 +1,104 @@
+"""The rigid body: how its weight rests on the wheels, and its three velocities in a step."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from countersteer.car.car import GRAVITY, Body, Wheels
+from countersteer.car.parameter import Scalar
+
+
+class Vector(NamedTuple):
+    """Something along the body's three freedoms: forward, left, yaw."""
+
+    x: Scalar
+    y: Scalar
+    yaw: Scalar
+
+
+class Symmetric(NamedTuple):
+    """A symmetric 3 x 3 matrix over the body's freedoms."""
+
+    xx: Scalar
+    yy: Scalar
+    ww: Scalar
+    xy: Scalar
+    xw: Scalar
+    yw: Scalar
+
+    def plus(self, weight: Scalar, a: Vector) -> "Symmetric":
+        """With weight · a aᵀ added."""
+        return Symmetric(
+            self.xx + weight * a.x * a.x,
+            self.yy + weight * a.y * a.y,
+            self.ww + weight * a.yaw * a.yaw,
+            self.xy + weight * a.x * a.y,
+            self.xw + weight * a.x * a.yaw,
+            self.yw + weight * a.y * a.yaw,
+        )
+
+    def plus_mixed(self, weight: Scalar, a: Vector, b: Vector) -> "Symmetric":
+        """With weight · (a bᵀ + b aᵀ) added."""
+        return Symmetric(
+            self.xx + 2 * weight * a.x * b.x,
+            self.yy + 2 * weight * a.y * b.y,
+            self.ww + 2 * weight * a.yaw * b.yaw,
+            self.xy + weight * (a.x * b.y + a.y * b.x),
+            self.xw + weight * (a.x * b.yaw + a.yaw * b.x),
+            self.yw + weight * (a.y * b.yaw + a.yaw * b.y),
+        )
+
+
+def dot(a: Vector, b: Vector) -> Scalar:
+    """Scalar product."""
+    return a.x * b.x + a.y * b.y + a.yaw * b.yaw
+
+
+def combine(weight_a: Scalar, a: Vector, weight_b: Scalar, b: Vector) -> Vector:
+    """weight_a · a + weight_b · b."""
+    return Vector(
+        weight_a * a.x + weight_b * b.x,
+        weight_a * a.y + weight_b * b.y,
+        weight_a * a.yaw + weight_b * b.yaw,
+    )
+
+
+def solve(m: Symmetric, b: Vector) -> Vector:
+    """The solution of m v = b for a positive definite m, by its LDLᵀ factors."""
+    l_yx, l_wx = m.xy / m.xx, m.xw / m.xx
+    d_y = m.yy - l_yx * m.xy
+    yw = m.yw - l_yx * m.xw
+    l_wy = yw / d_y
+    d_w = m.ww - l_wx * m.xw - l_wy * yw
+    z_y = b.y - l_yx * b.x
+    yaw = (b.yaw - l_wx * b.x - l_wy * z_y) / d_w
+    y = z_y / d_y - l_wy * yaw
+    return Vector(b.x / m.xx - l_yx * y - l_wx * yaw, y, yaw)
+
+
+def wheel_loads(body: Body, ax: Scalar, ay: Scalar) -> Wheels:
+    """Load on each wheel (N) while the body accelerates by ax forward and ay left (m/s²).
+
+    Moments about the centre of mass, height h, move m h ax / wheelbase from front to rear and
+    m h ay / track from left to right, by `front_roll_share` on the front axle. A wheel that has
+    nothing left to give stays at zero and the other axle takes over, so the loads are never
+    negative and always sum to the weight.
+    """
+    weight = body.mass * GRAVITY
+    behind = body.wheelbase - body.front_axle
+    front = (weight * behind - body.mass * body.cm_height * ax) / body.wheelbase
+    front = jnp.clip(front, 0.0, weight)
+    rear = weight - front
+    # A track of zero is a single-track car: nothing to move between left and right.
+    track = jnp.where(body.track > 0, body.track, 1.0)
+    aside = jnp.where(body.track > 0, body.mass * body.cm_height * ay / track, 0.0)
+    to_front = jnp.clip(body.front_roll_share * aside, -front / 2, front / 2)
+    to_rear = jnp.clip(aside - to_front, -rear / 2, rear / 2)
+    to_front = jnp.clip(aside - to_rear, -front / 2, front / 2)
+    return Wheels(front / 2 - to_front, front / 2 + to_front, rear / 2 - to_rear, rear / 2 + to_rear)
+
+
+def pair_in_air(loads: Wheels) -> Scalar:
+    """1 where both wheels of a side or of an axle carry nothing, else 0."""
+    fl, fr, rl, rr = (load <= 0 for load in loads)
+    return jnp.where((fl & rl) | (fr & rr) | (fl & fr) | (rl & rr), 1.0, 0.0)

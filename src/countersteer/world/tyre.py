@@ -1,0 +1,39 @@
+"""The brush tyre, as the stiffness of a contact against its slip velocity."""
+
+import jax.numpy as jnp
+
+from countersteer.car.car import Tire
+from countersteer.car.parameter import Scalar
+
+TINY = 1e-9  # keeps roots and their derivatives finite at no slip
+
+
+def stiffness(
+    tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar
+) -> tuple[Scalar, Scalar]:
+    """Longitudinal and lateral stiffness k of a contact (N s/m); its force is -k · slip velocity.
+
+    The brush model with a parabolic pressure and separate friction for adhering (mu) and sliding
+    (rho mu) tread. With slip velocity s, tread speed V = sqrt((R w)² + creep²), stiffness c per
+    unit of load F, and the linear force z = |c s / V|:
+
+        q = min(z / (3 mu), 1)                       the part of the contact that slides
+        k_i = F [ c_i (1 - q)² / V + rho mu q² (3 - 2 q) / |s| ]
+
+    For rho = 1 and one stiffness this is Fiala's cubic, z - z²/3mu + z³/27mu². The adhering part
+    pulls against the tread's deflection, the sliding part against the slip velocity itself, so
+    full sliding opposes the motion whatever the two stiffnesses are. Both k are >= 0: a contact
+    takes energy out. The largest force is F mu (4 - 3 rho) / (3 - 2 rho)².
+
+    Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 3 (brush model); E. Fiala, VDI-Z 96,
+    1954. The slip speeds are those of the contact over the ground (m/s), rim_speed is R w.
+    """
+    speed = jnp.sqrt(rim_speed**2 + tire.creep_speed**2)
+    linear_x = tire.longitudinal_stiffness / speed
+    linear_y = tire.cornering_stiffness / speed
+    linear = jnp.sqrt((linear_x * slip_x) ** 2 + (linear_y * slip_y) ** 2 + TINY**2)
+    slides = jnp.minimum(linear / (3 * tire.friction), 1.0)
+    adheres = (1 - slides) ** 2
+    slip = jnp.sqrt(slip_x**2 + slip_y**2 + TINY**2)
+    sliding = tire.sliding_ratio * tire.friction * slides**2 * (3 - 2 * slides) / slip
+    return load * (linear_x * adheres + sliding), load * (linear_y * adheres + sliding)
