@@ -1,21 +1,26 @@
 """The planar world: one tick takes a car from one instant to the next.
 
-`step` runs the named `STAGES` in their order. The stage `move` is the physics proper. Within it,
-`substep` is a first-order step in which every velocity is linearly implicit: each contact's force
-is -k times its slip velocity *at the end* of the step, with k >= 0 from the tyre law at its
-start. Wheels, differentials, rotor and back-EMF are eliminated in closed form, and a 3 x 3 system
-is left for the body. With G the matrix that maps velocities v to slips and M the inertias,
+`step` runs the named `STAGES` in their order. The stage `move` is the physics proper. A contact's
+force is -k times its slip velocity, with k >= 0 from the tyre law; with G the matrix that maps all
+velocities v (body, wheels) to slips, M the inertias, and D >= 0 what drag and back-EMF resist with,
 
-    M (v' - v) = -h Gᵀ K G v'   =>   ½ v'ᵀ M v' <= ½ vᵀ M v
+    M dv/dt = -(Gᵀ K G + D) v + a,        a the motor's torque.
 
-for any step h and any k >= 0: contacts cannot put energy in. Velocities are solved in the axes of
-the step's start, an inertial frame, then rotated exactly. `move` extrapolates one such step
-against two halves, which is of second order where the motion is smooth, and keeps the two halves
-wherever the extrapolation would hold more kinetic energy than the motor has put in.
+`move` predicts the middle of the tick with one implicit Euler step, takes all coefficients there,
+and holds them over the tick, in the body's axes at its middle. What is then linear is solved by
+two implicit Euler stages of gamma h, Alexander's L-stable method of second order, and the velocity
+is rotated exactly into those axes before and out of them after. So the scheme is of second order
+where the motion is smooth; and since the held system is symmetric, a method that is stable for
+each of its modes can only take kinetic energy out while a = 0, for any step h and any k >= 0:
+contacts cannot put energy in. Wheels, differentials, rotor and back-EMF are eliminated in closed
+form, and a 3 x 3 system is left for the body.
+
+Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 """
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -29,6 +34,7 @@ from countersteer.world.chassis import Symmetric, Vector, combine, dot
 from countersteer.world.state import Motion, State
 
 ROLL_OVER_TIME = 0.1  # s that a pair of wheels is in the air until the car counts as rolled over
+GAMMA = 1 - math.sqrt(0.5)  # of the two-stage method
 TOUCH_TIME = 0.2  # s without contact after which the next one is a new touch
 
 
@@ -131,87 +137,183 @@ def _delayed(
 
 
 def move(state: State, tick: Tick) -> tuple[State, Tick]:
-    """The motion over the tick: one substep extrapolated against two halves."""
+    """The motion over the tick: coefficients from its middle, then two stages of the solver."""
+    car, h, start = tick.car, tick.dt, state.motion
     goal = Command(
-        motor.duty(tick.car.motor, tick.asked.throttle),
-        servo.target(tick.car.servo, tick.asked.steering),
+        motor.duty(car.motor, tick.asked.throttle),
+        servo.target(car.servo, tick.asked.steering),
     )
-    start = state.motion
-    whole, _ = substep(tick.car, start, goal, tick.dt)
-    middle, work_1 = substep(tick.car, start, goal, tick.dt / 2)
-    halves, work_2 = substep(tick.car, middle, goal, tick.dt / 2)
-    better = jax.tree.map(lambda two, one: 2 * two - one, halves, whole)
-    bound = kinetic_energy(tick.car, start) + jnp.maximum(work_1 + work_2, 0.0)
-    holds = kinetic_energy(tick.car, better) <= bound
-    motion = jax.tree.map(lambda a, b: jnp.where(holds, a, b), better, halves)
+    velocity = Vector(start.vx, start.vy, start.yaw_rate)
+    middle = follow(car, start, goal, h / 2)
+    ahead, wheels = implicit(car, grip(car, start, tangent=True), velocity, start.wheels, h / 2)
+    middle = loaded(car, middle, start, combine(1.0, ahead, -1.0, velocity), h / 2)
+    ahead = rotated(ahead, h / 2 * start.yaw_rate)
+    middle = middle._replace(vx=ahead.x, vy=ahead.y, yaw_rate=ahead.yaw, wheels=wheels)
+
+    held = grip(car, middle)
+    before = rotated(velocity, h / 2 * start.yaw_rate)  # in the axes of the tick's middle
+    first, first_wheels = implicit(car, held, before, start.wheels, GAMMA * h)
+    lift = (1 - GAMMA) / GAMMA
+    lifted = Vector(*(v + lift * (w - v) for v, w in zip(before, first, strict=True)))
+    lifted_wheels = Wheels(
+        *(v + lift * (w - v) for v, w in zip(start.wheels, first_wheels, strict=True))
+    )
+    after, wheels = implicit(car, held, lifted, lifted_wheels, GAMMA * h)
+
+    end = loaded(car, follow(car, start, goal, h), start, combine(1.0, after, -1.0, before), h)
+    turn = h * (start.yaw_rate + after.yaw) / 2
+    angle = start.heading + h / 2 * start.yaw_rate
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    forward, left = h * (before.x + after.x) / 2, h * (before.y + after.y) / 2
+    after = rotated(after, h / 2 * after.yaw)
+    motion = end._replace(
+        x=start.x + cosine * forward - sine * left,
+        y=start.y + sine * forward + cosine * left,
+        heading=start.heading + turn,
+        vx=after.x,
+        vy=after.y,
+        yaw_rate=after.yaw,
+        wheels=wheels,
+        charge=start.charge - h * held.drive.battery_current / battery.capacity(car.battery),
+    )
     return state._replace(motion=motion), tick
 
 
-@jax.jit
-def substep(car: Car, motion: Motion, goal: Command, h: Scalar) -> tuple[Motion, Scalar]:
-    """A first-order step of h seconds, and the work of the motor in it (J).
+def follow(car: Car, motion: Motion, goal: Command, h: Scalar) -> Motion:
+    """Servo and speed controller after h seconds on their way to `goal`."""
+    return motion._replace(
+        steering=servo.turn(car.servo, motion.steering, goal.steering, h),
+        duty=motion.duty - (goal.throttle - motion.duty) * jnp.expm1(-h / car.motor.lag),
+    )
 
-    `goal` is the duty and the angle that speed controller and servo are heading for.
+
+def loaded(car: Car, motion: Motion, start: Motion, change: Vector, h: Scalar) -> Motion:
+    """The loads' accelerations after h seconds in which the velocity changed by this much."""
+    follows = -jnp.expm1(-h / car.body.load_lag)
+    return motion._replace(
+        load_ax=start.load_ax + follows * (change.x / h - start.load_ax),
+        load_ay=start.load_ay + follows * (change.y / h - start.load_ay),
+    )
+
+
+def rotated(v: Vector, angle: Scalar) -> Vector:
+    """The velocity v in axes turned by a small angle; its length is kept exactly.
+
+    The rotation is by 2 atan(a), which is `angle` to the fifth order.
     """
-    body, speeds = car.body, motion.wheels
+    a = angle / 2 * (1 + angle**2 / 12)
+    c, s = (1 - a**2) / (1 + a**2), 2 * a / (1 + a**2)
+    return Vector(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
+
+
+class Grip(NamedTuple):
+    """What acts on the car at an instant, as coefficients of its velocities."""
+
+    rolls: Wheels  # how the body's velocities move each contact along its wheel
+    slides: Wheels  # and to the wheel's left
+    along: Wheels  # stiffness of each contact, N s/m
+    across: Wheels
+    push_x: Wheels  # force of each contact at no slip, N; none where the stiffness is a chord
+    push_y: Wheels
+    drag: Wheels  # N m s
+    drive: motor.Drive
+
+
+@partial(jax.jit, static_argnames="tangent")
+def grip(car: Car, motion: Motion, tangent: bool = False) -> Grip:
+    """Contacts, drag and drive at an instant; contacts by their chords or by their tangents."""
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
     rolls, slides = contact_directions(car, motion.steering)
-    loads = chassis.wheel_loads(body, motion.load_ax, motion.load_ay)
-    tires = tires_by_wheel(car)
-
-    along, across, own = [], [], []
-    for tire, load, speed, roll, slide in zip(tires, loads, speeds, rolls, slides, strict=True):
+    loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
+    along, across, push_x, push_y = [], [], [], []
+    for tire, load, speed, roll, slide in zip(
+        tires_by_wheel(car), loads, motion.wheels, rolls, slides, strict=True
+    ):
         rim = tire.radius * speed
-        k_x, k_y = tyre.stiffness(tire, load, dot(roll, velocity) - rim, dot(slide, velocity), rim)
-        along.append(h * tire.radius * k_x)  # torque impulse per slip speed
-        across.append(h * k_y)
-        own.append(tire.inertia + along[-1] * tire.radius + h * drivetrain.drag(car, speed))
+        slip_x, slip_y = dot(roll, velocity) - rim, dot(slide, velocity)
+        k_x, k_y, tangent_x, tangent_y = tyre.stiffness(tire, load, slip_x, slip_y, rim)
+        along.append(tangent_x if tangent else k_x)
+        across.append(tangent_y if tangent else k_y)
+        push_x.append((along[-1] - k_x) * slip_x)
+        push_y.append((across[-1] - k_y) * slip_y)
+    driven = drivetrain.driven_speed(car, motion.wheels)
+    return Grip(
+        rolls,
+        slides,
+        Wheels(*along),
+        Wheels(*across),
+        Wheels(*push_x),
+        Wheels(*push_y),
+        Wheels(*(drivetrain.drag(car, speed) for speed in motion.wheels)),
+        motor.drive(
+            car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven
+        ),
+    )
+
+
+@jax.jit
+def implicit(
+    car: Car, held: Grip, velocity: Vector, wheels: Wheels, h: Scalar
+) -> tuple[Vector, Wheels]:
+    """Velocities h seconds later, by one implicit Euler step with the grip held as it is.
+
+    Solves (M + h C) v' = M v + h a, where C v - a are the forces of contacts, drag and drive.
+    """
+    body, tires = car.body, tires_by_wheel(car)
+    # Torque impulse per slip speed; inertia of each wheel with what resists it in the step.
+    pull = [h * tire.radius * k for tire, k in zip(tires, held.along, strict=True)]
+    bare = [tire.inertia + h * b for tire, b in zip(tires, held.drag, strict=True)]
+    own = [b + p * tire.radius for b, p, tire in zip(bare, pull, tires, strict=True)]
 
     # Wheels, differentials and rotor as a linear function of the hubs' speeds to come.
     lock = car.drivetrain
     front = drivetrain.axle(lock.front_lock, own[0], own[1], h)
     rear = drivetrain.axle(lock.rear_lock, own[2], own[3], h)
-    driven = drivetrain.driven_speed(car, speeds)
-    drive = motor.drive(car.motor, lock, car.battery, motion.duty, motion.charge, driven)
-    coupled = drivetrain.shaft(car, front, rear, drive, driven, h)
-    free = Wheels(*(tire.inertia * speed for tire, speed in zip(tires, speeds, strict=True)))
+    coupled = drivetrain.shaft(
+        car, front, rear, held.drive, drivetrain.driven_speed(car, wheels), h
+    )
+    free = Wheels(
+        *(
+            tire.inertia * speed - h * tire.radius * push
+            for tire, speed, push in zip(tires, wheels, held.push_x, strict=True)
+        )
+    )
     standing = _speeds(front, rear, coupled, free)  # if the hubs stood still
 
     # The body: (inertia + what the contacts resist with) velocity' = momentum + what wheels push.
     zero = 0.0 * body.mass
     matrix = Symmetric(body.mass, body.mass, body.yaw_inertia, zero, zero, zero)
     momentum = Vector(
-        body.mass * motion.vx, body.mass * motion.vy, body.yaw_inertia * motion.yaw_rate
+        body.mass * velocity.x, body.mass * velocity.y, body.yaw_inertia * velocity.yaw
     )
     for i in range(4):
-        matrix = matrix.plus(across[i], slides[i])
-        momentum = combine(1.0, momentum, along[i] * standing[i], rolls[i])
+        matrix = matrix.plus(h * held.across[i], held.slides[i])
+        push = pull[i] * standing[i] + h * held.push_x[i]
+        momentum = combine(1.0, momentum, push, held.rolls[i])
+        momentum = combine(1.0, momentum, h * held.push_y[i], held.slides[i])
     pulls = []
     for axle, left, right in ((front, 0, 1), (rear, 2, 3)):
-        for this, other, other_own in ((left, right, axle.own_right), (right, left, axle.own_left)):
-            # along/R - along² (inverse of the axle's matrix), without its cancellation
-            kept = own[this] - along[this] * tires[this].radius
-            resists = (kept * (other_own + axle.link) + axle.link * other_own) / axle.determinant
-            matrix = matrix.plus(along[this] / tires[this].radius * resists, rolls[this])
-        mixed = -along[left] * along[right] * axle.link / axle.determinant
-        matrix = matrix.plus_mixed(mixed, rolls[left], rolls[right])
+        for this, other_own in ((left, axle.own_right), (right, axle.own_left)):
+            # h k - pull² (inverse of the axle's matrix), written so that nothing cancels
+            resists = bare[this] * (other_own + axle.link) + axle.link * other_own
+            matrix = matrix.plus(
+                h * held.along[this] * resists / axle.determinant, held.rolls[this]
+            )
+        mixed = -pull[left] * pull[right] * axle.link / axle.determinant
+        matrix = matrix.plus_mixed(mixed, held.rolls[left], held.rolls[right])
         pulls.append(
             combine(
-                along[left] * axle.share_left,
-                rolls[left],
-                along[right] * axle.share_right,
-                rolls[right],
+                pull[left] * axle.share_left,
+                held.rolls[left],
+                pull[right] * axle.share_right,
+                held.rolls[right],
             )
         )
     matrix = matrix.plus(coupled.front_front, pulls[0]).plus(coupled.rear_rear, pulls[1])
     matrix = matrix.plus_mixed(coupled.front_rear, pulls[0], pulls[1])
     after = chassis.solve(matrix, momentum)
-
-    pushed = Wheels(*(free[i] + along[i] * dot(rolls[i], after) for i in range(4)))
-    turned = _speeds(front, rear, coupled, pushed)
-    driven_after = drivetrain.driven_speed(car, turned)
-    work = h * (drive.torque - drive.slope * driven_after) * driven_after
-    return _advance(car, motion, goal, after, turned, drive, h), work
+    pushed = Wheels(*(free[i] + pull[i] * dot(held.rolls[i], after) for i in range(4)))
+    return after, _speeds(front, rear, coupled, pushed)
 
 
 def _speeds(
@@ -221,40 +323,6 @@ def _speeds(
     return Wheels(
         *drivetrain.wheel_speeds(front, momenta.front_left, momenta.front_right, to_front),
         *drivetrain.wheel_speeds(rear, momenta.rear_left, momenta.rear_right, to_rear),
-    )
-
-
-def _advance(
-    car: Car,
-    motion: Motion,
-    goal: Command,
-    after: Vector,
-    speeds: Wheels,
-    drive: motor.Drive,
-    h: Scalar,
-) -> Motion:
-    """Everything else over the step, given the velocities at its end in the axes of its start."""
-    cosine, sine = jnp.cos(motion.heading), jnp.sin(motion.heading)
-    forward, left = h * (motion.vx + after.x) / 2, h * (motion.vy + after.y) / 2
-    turned = h * (motion.yaw_rate + after.yaw) / 2
-    # An exact rotation by 2 atan(a), which is `turned` to the fifth order.
-    a = turned / 2 * (1 + turned**2 / 12)
-    c, s = (1 - a**2) / (1 + a**2), 2 * a / (1 + a**2)
-    follows = -jnp.expm1(-h / car.body.load_lag)
-    ax, ay = (after.x - motion.vx) / h, (after.y - motion.vy) / h
-    return Motion(
-        motion.x + cosine * forward - sine * left,
-        motion.y + sine * forward + cosine * left,
-        motion.heading + turned,
-        c * after.x + s * after.y,
-        c * after.y - s * after.x,
-        after.yaw,
-        speeds,
-        servo.turn(car.servo, motion.steering, goal.steering, h),
-        motion.duty - (goal.throttle - motion.duty) * jnp.expm1(-h / car.motor.lag),
-        motion.load_ax + follows * (ax - motion.load_ax),
-        motion.load_ay + follows * (ay - motion.load_ay),
-        motion.charge - h * drive.battery_current / battery.capacity(car.battery),
     )
 
 
@@ -330,7 +398,7 @@ def contacts(car: Car, motion: Motion) -> Wheels:
     ):
         rim = tire.radius * speed
         slip_x, slip_y = dot(roll, velocity) - rim, dot(slide, velocity)
-        k_x, k_y = tyre.stiffness(tire, load, slip_x, slip_y, rim)
+        k_x, k_y, _, _ = tyre.stiffness(tire, load, slip_x, slip_y, rim)
         found.append(
             Contact(
                 -k_x * slip_x,

@@ -1,5 +1,7 @@
 """The brush tyre, as the stiffness of a contact against its slip velocity."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 
 from countersteer.car.car import Tire
@@ -8,10 +10,19 @@ from countersteer.car.parameter import Scalar
 TINY = 1e-9  # keeps roots and their derivatives finite at no slip
 
 
+class Contact(NamedTuple):
+    """Stiffness of a contact against its slip velocity (N s/m)."""
+
+    k_x: Scalar  # force over slip velocity
+    k_y: Scalar
+    tangent_x: Scalar  # change of force over change of slip velocity, >= 0
+    tangent_y: Scalar
+
+
 def stiffness(
     tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar
-) -> tuple[Scalar, Scalar]:
-    """Longitudinal and lateral stiffness k of a contact (N s/m); its force is -k · slip velocity.
+) -> Contact:
+    """The stiffness of a contact: longitudinal and lateral; its force is -k · slip velocity.
 
     The brush model with a parabolic pressure and separate friction for adhering (mu) and sliding
     (rho mu) tread. With slip velocity s, tread speed V = sqrt((R w)² + creep²), stiffness c per
@@ -36,4 +47,10 @@ def stiffness(
     adheres = (1 - slides) ** 2
     slip = jnp.sqrt(slip_x**2 + slip_y**2 + TINY**2)
     sliding = tire.sliding_ratio * tire.friction * slides**2 * (3 - 2 * slides) / slip
-    return load * (linear_x * adheres + sliding), load * (linear_y * adheres + sliding)
+    k_x, k_y = load * (linear_x * adheres + sliding), load * (linear_y * adheres + sliding)
+    # Along the slip the slope is dF/dz, and never less than none; across it, it is k itself.
+    slope = load * (1 - slides) * jnp.maximum(1 - (3 - 2 * tire.sliding_ratio) * slides, 0.0)
+    part_x = (slip_x**2 + TINY**2 / 2) / slip**2
+    tangent_x = part_x * slope * linear_x + (1 - part_x) * k_x
+    tangent_y = (1 - part_x) * slope * linear_y + part_x * k_y
+    return Contact(k_x, k_y, tangent_x, tangent_y)

@@ -1,0 +1,85 @@
+"""One drive as a self-contained HTML page that plays it."""
+
+import html
+import importlib.resources
+import json
+import re
+from typing import Any
+
+import numpy as np
+
+# What the eye can tell apart on the page: more digits would only make it larger.
+_DECIMALS = {
+    "time_s": 3,
+    "x_m": 4,
+    "y_m": 4,
+    "heading_rad": 4,
+    "angle_rad": 4,
+    "speed_mps": 3,
+    "slip_mps": 2,
+    "distance_m": 3,
+    "sideslip_deg": 2,
+    "yaw_rate_degps": 1,
+    "steering_deg": 2,
+    "steering_command_deg": 2,
+    "throttle": 3,
+}
+_DECIMALS_OF_OTHERS = 4
+# Forces are drawn as parts of the friction limit, so their digits have to follow its size:
+# a toy car pushes with a newton and a real one with thousands.
+_FORCES = ("force_x_n", "force_y_n", "limit_n")
+_STEPS_IN_LIMIT = 1000
+
+
+def report_html(view: dict[str, Any]) -> str:
+    """Return the page that plays the drive `view`, complete in itself: it fetches nothing.
+
+    `view` holds what JSON can hold, and no NaN or infinity (`ValueError` otherwise); it is left
+    unchanged. Text in it is shown as text, whatever it contains.
+    """
+    compact = {name: _rounded(name, value) for name, value in view.items()}
+    compact["wheels"] = [_rounded_wheel(wheel) for wheel in view["wheels"]]
+    data = json.dumps(compact, separators=(",", ":"), allow_nan=False)
+    fields = {
+        "title": html.escape(str(view["title"])),
+        # No "<" at all is left, so nothing in the data can end the script element around it.
+        "view": data.replace("<", "\\u003c"),
+    }
+    template = importlib.resources.files("countersteer.viewing") / "report_template.html"
+    # All fields in one pass: text that looks like a field stays text.
+    return re.sub(
+        r"\{\{(title|view)\}\}",
+        lambda field: fields[field[1]],
+        template.read_text(encoding="utf-8"),
+    )
+
+
+def _rounded_wheel(wheel: dict[str, Any]) -> dict[str, Any]:
+    """Return the series of one wheel with its forces rounded in proportion to its limit."""
+    largest = max(wheel["limit_n"], default=0.0)
+    decimals = max(0, int(np.ceil(np.log10(_STEPS_IN_LIMIT / largest)))) if largest > 0 else 3
+    return {
+        name: _rounded_series(value, decimals) if name in _FORCES else _rounded(name, value)
+        for name, value in wheel.items()
+    }
+
+
+def _rounded(name: str, value: Any) -> Any:
+    """Return `value` with every number in it rounded as suits the entry `name` it stands in."""
+    if isinstance(value, dict):
+        return {inner: _rounded(inner, part) for inner, part in value.items()}
+    decimals = _DECIMALS.get(name, _DECIMALS_OF_OTHERS)
+    if isinstance(value, float):
+        return round(value, decimals)
+    if not isinstance(value, list):
+        return value
+    if all(isinstance(part, float) for part in value):
+        return _rounded_series(value, decimals)
+    return [_rounded(name, part) for part in value]
+
+
+def _rounded_series(values: list[float], decimals: int) -> list[float]:
+    """Return `values` rounded; a series is where all the numbers are, so numpy does it."""
+    # Adding zero turns -0.0 into 0.0, which is shorter.
+    rounded: list[float] = (np.round(values, decimals) + 0.0).tolist()
+    return rounded
