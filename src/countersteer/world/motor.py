@@ -9,7 +9,7 @@ from countersteer.car.parameter import Scalar
 from countersteer.world import battery as pack
 
 NEUTRAL = 0.05  # duty over which the controller goes from its neutral brake to driving
-STANDSTILL = 1.0  # wheel speed (rad/s) over which braking hands over to reversing
+STANDSTILL = 10.0  # wheel speed (rad/s) over which braking hands over to reversing
 
 
 class Drive(NamedTuple):

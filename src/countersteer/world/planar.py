@@ -20,7 +20,6 @@ Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -34,6 +33,7 @@ from countersteer.world.chassis import Symmetric, Vector, combine, dot
 from countersteer.world.state import Motion, State
 
 ROLL_OVER_TIME = 0.1  # s that a pair of wheels is in the air until the car counts as rolled over
+TANGENT, CHORD = Wheels(1.0, 1.0, 1.0, 1.0), Wheels(0.0, 0.0, 0.0, 0.0)
 GAMMA = 1 - math.sqrt(0.5)  # of the two-stage method
 TOUCH_TIME = 0.2  # s without contact after which the next one is a new touch
 
@@ -144,21 +144,25 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
         servo.target(car.servo, tick.asked.steering),
     )
     velocity = Vector(start.vx, start.vy, start.yaw_rate)
-    middle = follow(car, start, goal, h / 2)
-    ahead, wheels = implicit(car, grip(car, start, tangent=True), velocity, start.wheels, h / 2)
-    middle = loaded(car, middle, start, combine(1.0, ahead, -1.0, velocity), h / 2)
+    at_start = grip(car, start)
+    ahead, wheels = implicit(car, at_start, TANGENT, velocity, start.wheels, h / 2)
+    middle = loaded(
+        car, follow(car, start, goal, h / 2), start, combine(1.0, ahead, -1.0, velocity), h / 2
+    )
     ahead = rotated(ahead, h / 2 * start.yaw_rate)
     middle = middle._replace(vx=ahead.x, vy=ahead.y, yaw_rate=ahead.yaw, wheels=wheels)
 
     held = grip(car, middle)
     before = rotated(velocity, h / 2 * start.yaw_rate)  # in the axes of the tick's middle
-    first, first_wheels = implicit(car, held, before, start.wheels, GAMMA * h)
-    lift = (1 - GAMMA) / GAMMA
-    lifted = Vector(*(v + lift * (w - v) for v, w in zip(before, first, strict=True)))
-    lifted_wheels = Wheels(
-        *(v + lift * (w - v) for v, w in zip(start.wheels, first_wheels, strict=True))
+    after, wheels = two_stages(car, held, steady(at_start, held), before, start.wheels, h)
+    bound = kinetic_energy(car, before, start.wheels) + h * jnp.maximum(
+        motor_power(car, held.drive, start.wheels), motor_power(car, held.drive, wheels)
     )
-    after, wheels = implicit(car, held, lifted, lifted_wheels, GAMMA * h)
+    holds = kinetic_energy(car, after, wheels) <= bound
+    safe = implicit(car, held, CHORD, before, start.wheels, h)
+    after, wheels = jax.tree.map(
+        lambda a, b: jnp.where(holds, a, b), (after, wheels), safe
+    )
 
     end = loaded(car, follow(car, start, goal, h), start, combine(1.0, after, -1.0, before), h)
     turn = h * (start.yaw_rate + after.yaw) / 2
@@ -177,6 +181,36 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
         charge=start.charge - h * held.drive.battery_current / battery.capacity(car.battery),
     )
     return state._replace(motion=motion), tick
+
+
+def two_stages(
+    car: Car, held: "Grip", lean: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
+) -> tuple[Vector, Wheels]:
+    """Velocities h seconds later, by Alexander's two implicit stages with the grip held."""
+    first, first_wheels = implicit(car, held, lean, velocity, wheels, GAMMA * h)
+    lifted, lifted_wheels = jax.tree.map(
+        lambda v, w: v + (1 - GAMMA) / GAMMA * (w - v), (velocity, wheels), (first, first_wheels)
+    )
+    return implicit(car, held, lean, lifted, lifted_wheels, GAMMA * h)
+
+
+def steady(start: "Grip", middle: "Grip") -> Wheels:
+    """1 for each contact whose slip keeps its direction from the tick's start to its middle.
+
+    Its force is then followed along its tangent: a sliding contact's is all but constant.
+    """
+    return Wheels(
+        *(
+            jnp.where(a.slip_x * b.slip_x + a.slip_y * b.slip_y > 0, 1.0, 0.0)
+            for a, b in zip(start.contacts, middle.contacts, strict=True)
+        )
+    )
+
+
+def motor_power(car: Car, drive: motor.Drive, wheels: Wheels) -> Scalar:
+    """Power that the motor puts in at these wheel speeds, never negative (W)."""
+    driven = drivetrain.driven_speed(car, wheels)
+    return jnp.maximum((drive.torque - drive.slope * driven) * driven, 0.0)
 
 
 def follow(car: Car, motion: Motion, goal: Command, h: Scalar) -> Motion:
@@ -211,57 +245,53 @@ class Grip(NamedTuple):
 
     rolls: Wheels  # how the body's velocities move each contact along its wheel
     slides: Wheels  # and to the wheel's left
-    along: Wheels  # stiffness of each contact, N s/m
-    across: Wheels
-    push_x: Wheels  # force of each contact at no slip, N; none where the stiffness is a chord
-    push_y: Wheels
+    contacts: Wheels  # a tyre.Contact each
     drag: Wheels  # N m s
     drive: motor.Drive
 
 
-@partial(jax.jit, static_argnames="tangent")
-def grip(car: Car, motion: Motion, tangent: bool = False) -> Grip:
-    """Contacts, drag and drive at an instant; contacts by their chords or by their tangents."""
+@jax.jit
+def grip(car: Car, motion: Motion) -> Grip:
+    """Contacts, drag and drive at an instant."""
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
     rolls, slides = contact_directions(car, motion.steering)
     loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
-    along, across, push_x, push_y = [], [], [], []
+    found = []
     for tire, load, speed, roll, slide in zip(
         tires_by_wheel(car), loads, motion.wheels, rolls, slides, strict=True
     ):
         rim = tire.radius * speed
-        slip_x, slip_y = dot(roll, velocity) - rim, dot(slide, velocity)
-        k_x, k_y, tangent_x, tangent_y = tyre.stiffness(tire, load, slip_x, slip_y, rim)
-        along.append(tangent_x if tangent else k_x)
-        across.append(tangent_y if tangent else k_y)
-        push_x.append((along[-1] - k_x) * slip_x)
-        push_y.append((across[-1] - k_y) * slip_y)
+        found.append(
+            tyre.contact(tire, load, dot(roll, velocity) - rim, dot(slide, velocity), rim)
+        )
     driven = drivetrain.driven_speed(car, motion.wheels)
     return Grip(
         rolls,
         slides,
-        Wheels(*along),
-        Wheels(*across),
-        Wheels(*push_x),
-        Wheels(*push_y),
+        Wheels(*found),  # type: ignore[arg-type]  # a contact each
         Wheels(*(drivetrain.drag(car, speed) for speed in motion.wheels)),
-        motor.drive(
-            car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven
-        ),
+        motor.drive(car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven),
     )
 
 
 @jax.jit
 def implicit(
-    car: Car, held: Grip, velocity: Vector, wheels: Wheels, h: Scalar
+    car: Car, held: "Grip", lean: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
 ) -> tuple[Vector, Wheels]:
     """Velocities h seconds later, by one implicit Euler step with the grip held as it is.
 
-    Solves (M + h C) v' = M v + h a, where C v - a are the forces of contacts, drag and drive.
+    Solves (M + h C) v' = M v + h a, where a - C v are the forces of contacts, drag and drive.
+    A contact's force is taken along its chord where `lean` is 0, along its tangent where it is 1.
     """
     body, tires = car.body, tires_by_wheel(car)
+    along, across, push_x, push_y = [], [], [], []
+    for c, w in zip(held.contacts, lean, strict=True):
+        along.append(c.k_x + w * (c.tangent_x - c.k_x))
+        across.append(c.k_y + w * (c.tangent_y - c.k_y))
+        push_x.append(w * (c.tangent_x - c.k_x) * c.slip_x)
+        push_y.append(w * (c.tangent_y - c.k_y) * c.slip_y)
     # Torque impulse per slip speed; inertia of each wheel with what resists it in the step.
-    pull = [h * tire.radius * k for tire, k in zip(tires, held.along, strict=True)]
+    pull = [h * tire.radius * k for tire, k in zip(tires, along, strict=True)]
     bare = [tire.inertia + h * b for tire, b in zip(tires, held.drag, strict=True)]
     own = [b + p * tire.radius for b, p, tire in zip(bare, pull, tires, strict=True)]
 
@@ -275,7 +305,7 @@ def implicit(
     free = Wheels(
         *(
             tire.inertia * speed - h * tire.radius * push
-            for tire, speed, push in zip(tires, wheels, held.push_x, strict=True)
+            for tire, speed, push in zip(tires, wheels, push_x, strict=True)
         )
     )
     standing = _speeds(front, rear, coupled, free)  # if the hubs stood still
@@ -287,17 +317,17 @@ def implicit(
         body.mass * velocity.x, body.mass * velocity.y, body.yaw_inertia * velocity.yaw
     )
     for i in range(4):
-        matrix = matrix.plus(h * held.across[i], held.slides[i])
-        push = pull[i] * standing[i] + h * held.push_x[i]
+        matrix = matrix.plus(h * across[i], held.slides[i])
+        push = pull[i] * standing[i] + h * push_x[i]
         momentum = combine(1.0, momentum, push, held.rolls[i])
-        momentum = combine(1.0, momentum, h * held.push_y[i], held.slides[i])
+        momentum = combine(1.0, momentum, h * push_y[i], held.slides[i])
     pulls = []
     for axle, left, right in ((front, 0, 1), (rear, 2, 3)):
         for this, other_own in ((left, axle.own_right), (right, axle.own_left)):
             # h k - pull² (inverse of the axle's matrix), written so that nothing cancels
             resists = bare[this] * (other_own + axle.link) + axle.link * other_own
             matrix = matrix.plus(
-                h * held.along[this] * resists / axle.determinant, held.rolls[this]
+                h * along[this] * resists / axle.determinant, held.rolls[this]
             )
         mixed = -pull[left] * pull[right] * axle.link / axle.determinant
         matrix = matrix.plus_mixed(mixed, held.rolls[left], held.rolls[right])
@@ -338,14 +368,14 @@ def contact_directions(car: Car, steering: Scalar) -> tuple[Wheels, Wheels]:
     return Wheels(*rolls), Wheels(*slides)  # type: ignore[arg-type]  # a vector each
 
 
-def kinetic_energy(car: Car, motion: Motion) -> Scalar:
+def kinetic_energy(car: Car, velocity: Vector, wheels: Wheels) -> Scalar:
     """Of the body, the wheels' spin and the rotor's (J)."""
     energy = (
-        car.body.mass * (motion.vx**2 + motion.vy**2) + car.body.yaw_inertia * motion.yaw_rate**2
+        car.body.mass * (velocity.x**2 + velocity.y**2) + car.body.yaw_inertia * velocity.yaw**2
     )
-    for tire, speed in zip(tires_by_wheel(car), motion.wheels, strict=True):
+    for tire, speed in zip(tires_by_wheel(car), wheels, strict=True):
         energy = energy + tire.inertia * speed**2
-    driven = drivetrain.driven_speed(car, motion.wheels)
+    driven = drivetrain.driven_speed(car, wheels)
     return (energy + drivetrain.rotor_inertia(car) * driven**2) / 2
 
 
@@ -374,38 +404,31 @@ def judge(state: State, tick: Tick) -> tuple[State, Tick]:
 STAGES: tuple[Callable[[State, Tick], tuple[State, Tick]], ...] = (delay, move, collide, judge)
 
 
-class Contact(NamedTuple):
-    """A wheel's contact, for pictures and tests: force in the wheel's own axes."""
+class Forces(NamedTuple):
+    """A wheel's contact for pictures and tests: force in the wheel's own axes."""
 
     force_x: Scalar  # N
     force_y: Scalar
-    limit: Scalar  # largest force that the tread can hold at this load, N
+    limit: Scalar  # largest force that an adhering tread can hold at this load, N
     slip: Scalar  # speed of the contact over the ground, m/s
     angle: Scalar  # of the wheel, rad
 
 
-def contacts(car: Car, motion: Motion) -> Wheels:
-    """The four contacts at an instant."""
-    velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
+def forces(car: Car, motion: Motion) -> Wheels:
+    """The four contacts' forces at an instant."""
+    held = grip(car, motion)
     loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
-    found = []
-    for tire, load, speed, roll, slide in zip(
-        tires_by_wheel(car),
-        loads,
-        motion.wheels,
-        *contact_directions(car, motion.steering),
-        strict=True,
-    ):
-        rim = tire.radius * speed
-        slip_x, slip_y = dot(roll, velocity) - rim, dot(slide, velocity)
-        k_x, k_y, _, _ = tyre.stiffness(tire, load, slip_x, slip_y, rim)
-        found.append(
-            Contact(
-                -k_x * slip_x,
-                -k_y * slip_y,
+    return Wheels(
+        *(
+            Forces(
+                -c.k_x * c.slip_x,
+                -c.k_y * c.slip_y,
                 tire.friction * load,
-                jnp.sqrt(slip_x**2 + slip_y**2),
+                jnp.sqrt(c.slip_x**2 + c.slip_y**2),
                 jnp.arctan2(roll.y, roll.x),
             )
+            for tire, load, roll, c in zip(
+                tires_by_wheel(car), loads, held.rolls, held.contacts, strict=True
+            )
         )
-    return Wheels(*found)  # type: ignore[arg-type]  # a contact each
+    )

@@ -11,18 +11,20 @@ TINY = 1e-9  # keeps roots and their derivatives finite at no slip
 
 
 class Contact(NamedTuple):
-    """Stiffness of a contact against its slip velocity (N s/m)."""
+    """A contact at an instant: its slip velocity (m/s) and its stiffness against it (N s/m)."""
 
-    k_x: Scalar  # force over slip velocity
+    slip_x: Scalar
+    slip_y: Scalar
+    k_x: Scalar  # force over slip velocity, >= 0
     k_y: Scalar
     tangent_x: Scalar  # change of force over change of slip velocity, >= 0
     tangent_y: Scalar
 
 
-def stiffness(
+def contact(
     tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar
 ) -> Contact:
-    """The stiffness of a contact: longitudinal and lateral; its force is -k · slip velocity.
+    """A contact's stiffness, longitudinal and lateral; its force is -k · slip velocity.
 
     The brush model with a parabolic pressure and separate friction for adhering (mu) and sliding
     (rho mu) tread. With slip velocity s, tread speed V = sqrt((R w)² + creep²), stiffness c per
@@ -53,4 +55,4 @@ def stiffness(
     part_x = (slip_x**2 + TINY**2 / 2) / slip**2
     tangent_x = part_x * slope * linear_x + (1 - part_x) * k_x
     tangent_y = (1 - part_x) * slope * linear_y + part_x * k_y
-    return Contact(k_x, k_y, tangent_x, tangent_y)
+    return Contact(slip_x, slip_y, k_x, k_y, tangent_x, tangent_y)
