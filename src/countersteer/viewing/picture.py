@@ -3,7 +3,7 @@
 import math
 import pathlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,97 +13,419 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-Points = NDArray[np.float64]  # shape (n, 2), metres unless said otherwise
+Array = NDArray[np.float64]
+Rectangle = tuple[float, float, float, float]  # left, bottom, width, height; parts of the figure
 
 _SIZE_IN = (14.0, 9.0)
 _DPI = 100
-_PAPER, _FLOOR, _INK, _SOFT, _LINE = "#fffefb", "#fbfaf6", "#1b2229", "#5a6570", "#e4e0d6"
-_WALL, _GLASS, _TURN, _SPEED = "#39434c", "#dde5ea", "#f1ecdf", "#0069a8"
+_PAPER, _FLOOR, _INK, _SOFT, _LINE = "#fffefb", "#fbfaf6", "#1b2229", "#5a6570", "#e2ded3"
+_WALL, _GLASS, _TURN, _SPEED = "#39434c", "#303a43", "#f3eee1", "#0069a8"
 _GOOD, _BAD = "#00694f", "#a3210f"
-# From calm to wild, and readable without telling red from green: the lightness falls as well.
-_SLIP_COLOURS = ("#93a7b7", "#e0901f", "#a3210f")
+# From calm to wild. The lightness falls all the way, so the order needs no red and green.
+_SLIP_COLOURS = ("#a9bac7", "#e39a2b", "#a3210f")
 
-_SKID_FROM_MPS, _SKID_FULL_MPS, _SKID_ALPHA = 0.3, 2.0, (0.10, 0.42)
+_SKID_FROM_MPS, _SKID_FULL_MPS = 0.3, 2.0
+_SKID_FAINTEST, _SKID_DARKEST = 0.12, 0.42
+_MOST_SKID_SAMPLES = 2000
 
 # Outlines in halves of the car's length and width, from the centre of the outline.
-_BODY = np.array(
-    [(-1.0, 0.0), (-0.99, 0.62), (-0.93, 0.92), (-0.8, 1.0), (-0.5, 0.96), (-0.2, 0.93)]
-    + [(0.2, 0.93), (0.62, 0.96), (0.82, 0.88), (0.94, 0.66), (1.0, 0.3)]
-    + [(1.0, -0.3), (0.94, -0.66), (0.82, -0.88), (0.62, -0.96), (0.2, -0.93)]
-    + [(-0.2, -0.93), (-0.5, -0.96), (-0.8, -1.0), (-0.93, -0.92), (-0.99, -0.62)]
-)
-_WINDSCREEN = np.array(
-    [(0.3, 0.6), (0.36, 0.0), (0.3, -0.6), (0.06, -0.5), (0.09, 0.0), (0.06, 0.5)]
-)
-_REAR_WINDOW = np.array([(-0.6, 0.56), (-0.62, 0.0), (-0.6, -0.56), (-0.42, -0.46), (-0.42, 0.46)])
-_WING = np.array([(-1.0, 0.86), (-0.86, 0.86), (-0.86, -0.86), (-1.0, -0.86)])
+_LEFT_OF_BODY = [
+    *((-1.0, 0.3), (-0.98, 0.7), (-0.92, 0.92), (-0.8, 1.0), (-0.5, 0.96), (-0.2, 0.93)),
+    *((0.2, 0.93), (0.62, 0.96), (0.82, 0.88), (0.94, 0.66), (1.0, 0.3)),
+]
+_BODY = np.array(_LEFT_OF_BODY + [(u, -v) for u, v in reversed(_LEFT_OF_BODY)])
+_WINDSCREEN = np.array([(0.3, 0.6), (0.36, 0), (0.3, -0.6), (0.06, -0.5), (0.09, 0), (0.06, 0.5)])
+_REAR_WINDOW = np.array([(-0.6, 0.56), (-0.62, 0), (-0.6, -0.56), (-0.42, -0.46), (-0.42, 0.46)])
 
-_GHOST_EVERY_S, _GHOST_EVERY_IN_TURN_S, _MOST_GHOSTS = 0.25, 0.125, 160
-# Ghosts of different laps would hide each other: nearer than this part of a length, one is left
-# out, unless it follows the other directly.
-_CLEARANCE, _FOLLOWS_S = 0.55, 1.0
+_GHOST_EVERY_S, _GHOST_EVERY_IN_TURN_S, _MOST_GHOSTS = 0.25, 0.15, 160
+# Ghosts that hide each other show nothing. These are the least distances, in car lengths, from a
+# ghost of the same pass and from one of an earlier lap.
+_STEP_LENGTHS, _CLEARANCE_LENGTHS = 0.4, 0.6
+_SAME_PASS_S, _TURNED_RAD = 1.0, math.radians(20)
+
+_MOST_TURN_NUMBERS = 16
+_DASHES = (3.0, 2.0)
+
+
+class _Layout(NamedTuple):
+    """Where the parts of the picture are."""
+
+    floor: Rectangle
+    strips: Rectangle
+
+
+# Most courses are about as wide as they are tall; a long one gets the whole width.
+_BESIDE = _Layout(floor=(0.022, 0.085, 0.55, 0.79), strips=(0.615, 0.07, 0.363, 0.805))
+_BELOW = _Layout(floor=(0.022, 0.5, 0.956, 0.375), strips=(0.05, 0.06, 0.928, 0.37))
+_LONG = 2.0
 
 
 def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
-    """Write to `path`, as PNG, the drive `view` from above and over time.
+    """Write to `path`, as PNG, the drive `view` (one sample or more) from above and over time.
 
-    The car stands on its path at regular intervals, coloured by its sideslip, denser in turns.
+    The car stands on its path at regular intervals, denser in turns, coloured by its sideslip.
     An existing file is replaced.
     """
-    # Matplotlib takes longer to import than all the rest; who draws nothing does not wait for it.
+    # Matplotlib takes longer to import than the drawing: who draws nothing does not wait for it.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor=_PAPER)
     canvas = FigureCanvasAgg(figure)
+    low, high = _bounds(view)
+    layout = _BELOW if high[0] - low[0] > _LONG * (high[1] - low[1]) else _BESIDE
     colours = LinearSegmentedColormap.from_list("sideslip", _SLIP_COLOURS)
-    largest = max((abs(angle) for angle in view["sideslip_deg"]), default=0.0)
-    scale_end = max(10, 5 * math.ceil(largest / 5))
+    largest = float(np.max(np.abs(view["sideslip_deg"])))
+    colours_end = max(20, 5 * math.ceil(largest / 5))
 
     _write_headline(figure, view, largest)
-    _draw_floor(figure, view, colours, scale_end)
-    _draw_strips(figure, view, colours)
-    canvas.print_png(path)
+    metres_per_width = _draw_floor(figure, layout.floor, view, colours, colours_end)
+    _draw_keys(figure, layout.floor, colours, colours_end, metres_per_width)
+    _draw_strips(figure, layout.strips, view)
+    canvas.print_png(str(path))
+
+
+def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
+    """Return the lowest and highest x and y of what is to be seen, with a margin."""
+    length = view["car"]["length_m"]
+    places = np.column_stack([view["x_m"], view["y_m"]])
+    corners = np.array(view["walls_m"], dtype=float).reshape(-1, 2)
+    low = np.vstack([places - 0.6 * length, corners]).min(axis=0)
+    high = np.vstack([places + 0.6 * length, corners]).max(axis=0)
+    return low - 0.25 * length, high + 0.25 * length
 
 
 def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: float) -> None:
-    """Write what was driven and how it ended across the top."""
+    """Write across the top what was driven and how it ended."""
     summary = view["summary"]
-    figure.text(0.022, 0.953, str(view["title"]), color=_INK, size=18, weight="bold", va="center")
     status = str(summary["status"])
-    figure.text(
-        0.022,
-        0.916,
-        status[:1].upper() + status[1:],
-        color=_GOOD if summary["completed"] else _BAD,
-        size=12.5,
-        weight="bold",
-        va="center",
-    )
-    lap_time = summary.get("lap_time_s")
-    times = view["time_s"]
-    facts = [
+    figure.text(0.022, 0.955, str(view["title"]), color=_INK, size=18, weight="bold", va="center")
+    said = status[:1].upper() + status[1:]
+    mood = _GOOD if summary["completed"] else _BAD
+    figure.text(0.022, 0.914, said, color=mood, size=13, weight="bold", va="center")
+    lap_time, times = summary.get("lap_time_s"), view["time_s"]
+    facts = (
         ("drive time", f"{times[-1] - times[0]:.2f} s")
         if lap_time is None
         else ("lap time", f"{lap_time:.2f} s"),
-        ("wall contacts", str(summary["wall_contacts"])),
+        ("wall contacts", f"{summary['wall_contacts']}"),
         ("largest sideslip", f"{largest_sideslip:.0f}°"),
-    ]
-    for right, (name, value) in zip((0.715, 0.845, 0.978), facts, strict=True):
-        figure.text(right, 0.953, value, color=_INK, size=16, weight="bold", va="center", ha="right")
-        figure.text(right, 0.918, name, color=_SOFT, size=10.5, va="center", ha="right")
+    )
+    for right, (name, value) in zip((0.718, 0.845, 0.978), facts, strict=True):
+        bold = figure.text(right, 0.955, value, color=_INK, size=17, va="center", ha="right")
+        bold.set_fontweight("bold")
+        figure.text(right, 0.916, name, color=_SOFT, size=10.5, va="center", ha="right")
+
+
+# -------------------------------------------------------------------------------------------------
+# The drive from above
+# -------------------------------------------------------------------------------------------------
 
 
 def _draw_floor(
-    figure: "Figure", view: dict[str, Any], colours: "Colormap", scale_end: float
-) -> None:
-    """Draw the drive from above, on the left."""
+    figure: "Figure",
+    place: Rectangle,
+    view: dict[str, Any],
+    colours: "Colormap",
+    colours_end: float,
+) -> float:
+    """Draw the drive from above and return how many metres wide the whole figure would be."""
     from matplotlib.collections import LineCollection
 
-    position = Points_of(view)
-    axes = figure.add_axes((0.022, 0.035, 0.535, 0.85), facecolor=_FLOOR)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes = figure.add_axes(place, facecolor=_FLOOR, xticks=[], yticks=[])
     for side in axes.spines.values():
         side.set_color(_LINE)
+    # One scale for both axes: the limits are widened to the shape of the place.
+    low, high = _bounds(view)
+    inches = np.array([place[2] * _SIZE_IN[0], place[3] * _SIZE_IN[1]])
+    metres_per_inch = float(np.max((high - low) / inches))
+    middle, half = (low + high) / 2, inches * metres_per_inch / 2
+    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+
+    _draw_skid_marks(axes, view, 72 / metres_per_inch)
+    axes.plot(view["x_m"], view["y_m"], color=_SOFT, linewidth=0.8, alpha=0.6, zorder=2)
+    _draw_ghosts(axes, view, colours, colours_end)
+    walls = np.array(view["walls_m"], dtype=float).reshape(-1, 2, 2)
+    axes.add_collection(
+        LineCollection(list(walls), colors=_WALL, linewidths=3.5, capstyle="round", zorder=4),
+        autolim=False,
+    )
+    _number_turns(axes, view)
+    return metres_per_inch * _SIZE_IN[0]
+
+
+def _draw_skid_marks(axes: "Axes", view: dict[str, Any], points_per_metre: float) -> None:
+    """Draw where each wheel slipped, darker where it slipped faster."""
+    from matplotlib.collections import LineCollection
+
+    stride = math.ceil(len(view["time_s"]) / _MOST_SKID_SAMPLES)
+    poses = _poses(view)[::stride]
+    for wheel, series in zip(view["car"]["wheels"], view["wheels"], strict=False):
+        track = _placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
+        slip = np.array(series["slip_mps"][::stride])[:-1]
+        marks = slip > _SKID_FROM_MPS
+        share = np.clip((slip[marks] - _SKID_FROM_MPS) / (_SKID_FULL_MPS - _SKID_FROM_MPS), 0, 1)
+        shades = np.zeros((len(share), 4))
+        shades[:, 3] = _SKID_FAINTEST + (_SKID_DARKEST - _SKID_FAINTEST) * share
+        axes.add_collection(
+            LineCollection(
+                list(np.stack([track[:-1], track[1:]], axis=1)[marks]),
+                colors=shades,
+                linewidths=max(0.8, 0.9 * wheel["width_m"] * points_per_metre),
+                capstyle="butt",
+                zorder=1,
+            ),
+            autolim=False,
+        )
+
+
+def _draw_ghosts(
+    axes: "Axes", view: dict[str, Any], colours: "Colormap", colours_end: float
+) -> None:
+    """Draw the car at intervals along its path, later ones over earlier ones."""
+    from matplotlib.collections import PolyCollection
+
+    car = view["car"]
+    chosen = _ghosts(view)
+    poses = _poses(view)[chosen]
+    half = np.array([car["length_m"] / 2, car["width_m"] / 2])
+    centre = np.array([car["center_x_m"], 0.0])
+    paints = colours(np.abs(np.array(view["sideslip_deg"])[chosen]) / colours_end)
+    body, windscreen, rear_window = (
+        _placed(shape * half + centre, poses) for shape in (_BODY, _WINDSCREEN, _REAR_WINDOW)
+    )
+    wheels = [_placed_wheel(view, k, chosen, poses) for k in range(len(car["wheels"]))]
+    shapes: list[Array] = []
+    faces: list[Any] = []
+    # All in one collection, because what belongs to one car has to lie together in depth.
+    for k, paint in enumerate(paints):
+        shapes += [body[k], windscreen[k], rear_window[k], *(wheel[k] for wheel in wheels)]
+        faces += [paint, _GLASS, _GLASS, *(_INK for _ in wheels)]
+    edges = [_PAPER, "none", "none", *("none" for _ in wheels)] * len(paints)
+    axes.add_collection(
+        PolyCollection(
+            shapes, facecolors=faces, edgecolors=edges, linewidths=1.1, zorder=3, joinstyle="round"
+        ),
+        autolim=False,
+    )
+
+
+def _ghosts(view: dict[str, Any]) -> NDArray[np.intp]:
+    """Return at which samples the car is drawn."""
+    time, poses = np.array(view["time_s"]), _poses(view)
+    turns = view["summary"]["turns"]
+    length = view["car"]["length_m"]
+    turning = sum(turn["end_s"] - turn["begin_s"] for turn in turns)
+    straight = time[-1] - time[0] - turning
+    planned = turning / _GHOST_EVERY_IN_TURN_S + straight / _GHOST_EVERY_S
+    stretch = max(1.0, planned / _MOST_GHOSTS)
+    chosen: list[int] = []
+    moment = time[0]
+    while moment <= time[-1]:
+        sample = int(np.searchsorted(time, moment))
+        earlier = poses[chosen]
+        distance = np.hypot(*(earlier[:, :2] - poses[sample, :2]).T) / length
+        same_pass = time[sample] - time[chosen] < _SAME_PASS_S * stretch
+        turned = np.abs(np.sin((earlier[:, 2] - poses[sample, 2]) / 2)) > math.sin(_TURNED_RAD / 2)
+        least = np.where(same_pass, np.where(turned, 0, _STEP_LENGTHS), _CLEARANCE_LENGTHS)
+        if np.all(distance >= least):
+            chosen.append(sample)
+        in_turn = any(turn["begin_s"] <= moment < turn["end_s"] for turn in turns)
+        moment += stretch * (_GHOST_EVERY_IN_TURN_S if in_turn else _GHOST_EVERY_S)
+    return np.array(chosen, dtype=np.intp)
+
+
+def _number_turns(axes: "Axes", view: dict[str, Any]) -> None:
+    """Write each turn's number on the inside of its middle, while there are not too many."""
+    turns = view["summary"]["turns"]
+    if len(turns) > _MOST_TURN_NUMBERS:
+        return
+    time = np.array(view["time_s"])
+    for number, turn in enumerate(turns, start=1):
+        begin, middle, end = np.clip(
+            np.searchsorted(
+                time, [turn["begin_s"], (turn["begin_s"] + turn["end_s"]) / 2, turn["end_s"]]
+            ),
+            0,
+            len(time) - 1,
+        )
+        points = _poses(view)[[begin, middle, end], :2]
+        inward = (points[0] + points[2]) / 2 - points[1]
+        norm = float(np.hypot(*inward))
+        if norm == 0:
+            continue
+        x, y = points[1] + inward / norm * 1.1 * view["car"]["length_m"]
+        text = axes.text(x, y, str(number), color=_SOFT, size=15, ha="center", va="center")
+        text.set(weight="bold", zorder=5)
+
+
+def _poses(view: dict[str, Any]) -> Array:
+    """Return x, y and heading of the car at each sample, a row each."""
+    return np.column_stack([view["x_m"], view["y_m"], view["heading_rad"]])
+
+
+def _placed(points: Array, poses: Array) -> Array:
+    """Return where `points` of the car (a row each) are on the floor for each pose."""
+    cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([poses[:, :1] + cos * x - sin * y, poses[:, 1:2] + sin * x + cos * y], axis=-1)
+
+
+def _placed_wheel(
+    view: dict[str, Any], which: int, chosen: NDArray[np.intp], poses: Array
+) -> Array:
+    """Return the outline on the floor of wheel `which` at the `chosen` samples."""
+    wheel = view["car"]["wheels"][which]
+    if view["wheels"]:
+        angle = np.array(view["wheels"][which]["angle_rad"])[chosen]
+    elif which < 2:
+        angle = np.radians(np.array(view["steering_deg"])[chosen])
+    else:
+        angle = np.zeros(len(chosen))
+    hub = _placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
+    radius, half_width = wheel["radius_m"], wheel["width_m"] / 2
+    tread = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (radius, half_width)
+    return _placed(tread, np.column_stack([hub, poses[:, 2] + angle]))
+
+
+def _draw_keys(
+    figure: "Figure",
+    floor: Rectangle,
+    colours: "Colormap",
+    colours_end: float,
+    metres_per_width: float,
+) -> None:
+    """Draw what the colours mean and how long a metre is, under the floor."""
+    left, bottom, width, _ = floor
+    y, right = bottom - 0.027, left + width
+    figure.text(left, y, "sideslip  0°", color=_SOFT, size=10.5, va="center")
+    _paint_ramp(figure, colours, (left + 0.068, y - 0.006, 0.1, 0.012))
+    figure.text(left + 0.174, y, f"{colours_end}°", color=_SOFT, size=10.5, va="center")
+    metres = _nice_step(0.05 * metres_per_width)
+    start = right - metres / metres_per_width
+    _draw_line(
+        figure,
+        [(start, y + 0.007), (start, y - 0.007), (right, y - 0.007), (right, y + 0.007)],
+        colour=_SOFT,
+        width=1.4,
+    )
+    label = figure.text(start - 0.008, y, f"{metres:g} m", color=_SOFT, size=10.5, va="center")
+    label.set_horizontalalignment("right")
+
+
+def _paint_ramp(figure: "Figure", colours: "Colormap", place: Rectangle) -> None:
+    """Paint all of `colours`, from left to right, into `place`."""
+    across, up = (int(inches * _DPI) for inches in _SIZE_IN)
+    left, bottom, width, height = place
+    shades = colours(np.linspace(0, 1, int(width * across)))
+    pixels = np.broadcast_to(shades, (int(height * up), *shades.shape))
+    figure.figimage(pixels, int(left * across), int(bottom * up))
+
+
+def _draw_line(
+    figure: "Figure",
+    points: list[tuple[float, float]],
+    colour: str,
+    width: float,
+    dashes: tuple[float, float] | None = None,
+) -> None:
+    """Draw a line through `points`, which are in parts of the figure."""
+    from matplotlib.lines import Line2D
+
+    x, y = zip(*points, strict=True)
+    line = Line2D(x, y, color=colour, linewidth=width, transform=figure.transFigure)
+    if dashes is not None:
+        line.set_dashes(dashes)
+    figure.add_artist(line)
+
+
+# -------------------------------------------------------------------------------------------------
+# The drive over time
+# -------------------------------------------------------------------------------------------------
+
+
+class _Strip(NamedTuple):
+    """One quantity over time."""
+
+    name: str
+    unit: str
+    values: Sequence[float]
+    colour: str
+    command: Sequence[float] | None = None
+
+
+def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> None:
+    """Draw what was measured over time, one strip under the other."""
+    strips = (
+        _Strip("Speed", "m/s", view["speed_mps"], _SPEED),
+        _Strip("Sideslip", "°", view["sideslip_deg"], "#c97a10"),
+        _Strip("Yaw rate", "°/s", view["yaw_rate_degps"], _SOFT),
+        _Strip("Steering", "°", view["steering_deg"], _SOFT, view["steering_command_deg"]),
+        _Strip("Throttle", "%", [100 * part for part in view["throttle"]], _SOFT),
+    )
+    left, bottom, width, height = place
+    pitch = height / len(strips)
+    caption = 0.026
+    for k, strip in enumerate(strips):
+        strip_bottom = bottom + height - (k + 1) * pitch
+        axes = figure.add_axes((left, strip_bottom, width, pitch - caption - 0.004))
+        _draw_strip(axes, strip, view, is_last=k == len(strips) - 1)
+        _write_caption(figure, (left, strip_bottom + pitch - caption / 2 - 0.002), width, strip)
+
+
+def _draw_strip(axes: "Axes", strip: _Strip, view: dict[str, Any], is_last: bool) -> None:
+    """Draw the curves of one strip; only the last one says the time."""
+    time = view["time_s"]
+    shown = [0.0, *strip.values, *(strip.command or ())]
+    low, high = min(shown), max(shown)
+    # A quantity that never changes still needs a height.
+    span = max(high - low, 1e-3)
+    for turn in view["summary"]["turns"]:
+        axes.axvspan(turn["begin_s"], turn["end_s"], color=_TURN, linewidth=0, zorder=0)
+    axes.fill_between(time, strip.values, color=strip.colour, alpha=0.12, linewidth=0, zorder=2)
+    axes.plot(time, strip.values, color=strip.colour, linewidth=1.5, zorder=3)
+    if strip.command is not None:
+        axes.plot(time, strip.command, color=_INK, linewidth=0.8, dashes=_DASHES, zorder=3)
+    axes.set_xlim(time[0], max(time[-1], time[0] + 1e-3))
+    axes.set_ylim(low - 0.06 * span, high + 0.06 * span)
+    axes.set_yticks(_ticks(low, high, span / 2.6))
+    axes.set_xticks(_ticks(time[0], time[-1], (time[-1] - time[0]) / 8 or 1))
+    axes.grid(axis="y", color=_LINE, linewidth=0.8, zorder=1)
+    axes.set_axisbelow(True)
+    axes.set_frame_on(False)
+    axes.tick_params(
+        length=0, labelsize=9.5, labelcolor=_SOFT, pad=5, labelbottom=is_last, bottom=is_last
+    )
+    if is_last:
+        axes.set_xlabel("time, s", color=_SOFT, size=9.5, labelpad=3, loc="right")
+
+
+def _write_caption(
+    figure: "Figure", start: tuple[float, float], width: float, strip: _Strip
+) -> None:
+    """Write the strip's name at `start` and, where it has two curves, the key at the other end."""
+    x, y = start
+    name = figure.text(x, y, f"{strip.name}, {strip.unit}", color=_INK, size=10.5, va="center")
+    name.set_fontweight("bold")
+    if strip.command is None:
+        return
+    right = x + width
+    _draw_line(figure, [(right - 0.145, y), (right - 0.13, y)], strip.colour, 1.8)
+    figure.text(right - 0.125, y, "actual", color=_SOFT, size=9.5, va="center")
+    _draw_line(figure, [(right - 0.075, y), (right - 0.057, y)], _INK, 0.9, _DASHES)
+    figure.text(right, y, "command", color=_SOFT, size=9.5, va="center", ha="right")
+
+
+def _nice_step(least: float) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten that is at least `least` (> 0)."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= 0.9999 * least)
+
+
+def _ticks(low: float, high: float, least_step: float) -> list[float]:
+    """Return the round numbers from `low` to `high`, at least `least_step` apart."""
+    step = _nice_step(least_step)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [step * k for k in range(first, last + 1)]

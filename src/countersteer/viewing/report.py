@@ -32,7 +32,7 @@ _STEPS_IN_LIMIT = 1000
 
 
 def report_html(view: dict[str, Any]) -> str:
-    """Return the page that plays the drive `view`, complete in itself: it fetches nothing.
+    """Return the page that plays the drive `view` (one sample or more); it fetches nothing.
 
     `view` holds what JSON can hold, and no NaN or infinity (`ValueError` otherwise); it is left
     unchanged. Text in it is shown as text, whatever it contains.

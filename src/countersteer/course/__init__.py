@@ -1,0 +1,1 @@
+"""Courses: walls, centre line, start and goal."""

@@ -1,0 +1,248 @@
+"""`Course`: a corridor of straights and turns, or free walls, with a start and a goal."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from countersteer.car.car import GRAVITY, Car
+from countersteer.errors import InputError
+
+ARC_STEP = math.radians(5)  # of the chords that stand for a rounded corner
+ARRIVAL = 0.02  # m before the goal line that count as having reached it
+
+
+class Turn(NamedTuple):
+    """A corner of the centre line."""
+
+    distance: float  # of the corner point (or the middle of its arc) along the centre line, m
+    angle: float  # positive to the left, rad
+
+
+@dataclasses.dataclass(frozen=True)
+class Course:
+    """Immutable; distances are along the centre line, in metres. Angles in rad."""
+
+    name: str
+    width: float | None  # None where there are only free walls
+    closed: bool
+    line: np.ndarray  # (n, 2) corner points of the centre line, the first again at the end if closed
+    walls: np.ndarray  # (m, 4) x, y of both ends
+    turns: tuple[Turn, ...]
+    start: tuple[float, float, float]  # x, y, heading
+    start_distance: float
+    goal_distance: float | None  # None: nothing to reach
+
+    @property
+    def length(self) -> float:
+        """Of the centre line."""
+        return float(self.marks[-1]) if len(self.line) else 0.0
+
+    @property
+    def marks(self) -> np.ndarray:
+        """Distance of each point of the centre line."""
+        steps = np.hypot(*np.diff(self.line, axis=0).T) if len(self.line) > 1 else np.zeros(0)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def lap_end(self, laps: int) -> float | None:
+        """Unwrapped distance at which a drive of so many laps is done."""
+        if self.goal_distance is None:
+            return None
+        return self.goal_distance + (laps - 1) * self.length if self.closed else self.goal_distance
+
+    def turns_ahead(self, laps: int) -> list[Turn]:
+        """The turns between start and goal, at unwrapped distances, in the order driven."""
+        end = self.lap_end(laps)
+        rounds = range(laps + 1) if self.closed else range(1)
+        ahead = [Turn(t.distance + k * self.length, t.angle) for k in rounds for t in self.turns]
+        return [t for t in ahead if self.start_distance < t.distance < (end or 0.0)]
+
+
+def from_segments(
+    name: str,
+    width: float,
+    closed: bool,
+    segments: list[tuple[str, float, float]],
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    goal: float | None = None,
+) -> Course:
+    """A corridor. `segments` holds ("straight", length, 0) and ("turn", angle, radius).
+
+    Straights run between the corner points of the centre line; a radius rounds the corner, and a
+    radius of 0 mitres it. `start` is distance, offset to the left, heading against the line.
+    Raises `InputError` where the segments do not make a corridor.
+    """
+    corners, angles, radii = [np.zeros(2)], [0.0], [0.0]
+    heading, turn, radius, fresh = 0.0, 0.0, 0.0, True
+    for kind, value, bend in segments:
+        if kind == "turn":
+            if turn or fresh:
+                raise InputError(f"{name}: a turn must stand between two straights")
+            turn, radius = value, bend
+            continue
+        if not fresh:
+            angles.append(turn)
+            radii.append(radius)
+        heading += turn
+        corners.append(corners[-1] + value * np.array([math.cos(heading), math.sin(heading)]))
+        turn, radius, fresh = 0.0, 0.0, False
+    if len(corners) < 2:
+        raise InputError(f"{name}: a course needs a straight")
+    if closed:
+        if np.hypot(*(corners[-1] - corners[0])) > 1e-6 or abs(
+            math.remainder(heading + turn, 2 * math.pi)
+        ) > 1e-6:
+            raise InputError(f"{name}: closed = true, but the segments do not come back to start")
+        angles[0], radii[0] = turn, radius
+    points, turns = _rounded(name, np.array(corners), angles, radii, closed)
+    walls = np.concatenate([_offset(points, closed, side * width / 2) for side in (1, -1)])
+    course = Course(name, width, closed, points, walls, turns, (0.0, 0.0, 0.0), start[0], None)
+    length = course.length
+    if not 0 <= start[0] <= length:
+        raise InputError(f"{name}: start.distance_m must be in [0, {length:g}]")
+    if goal is None:
+        goal = start[0] + length if closed else length
+    if goal <= start[0]:
+        raise InputError(f"{name}: goal.distance_m must lie beyond start.distance_m")
+    if not closed and goal > length + 1e-9:
+        raise InputError(f"{name}: goal.distance_m must be at most {length:g}")
+    x, y, along = place(course, start[0])
+    x, y = x - math.sin(along) * start[1], y + math.cos(along) * start[1]
+    return dataclasses.replace(course, start=(x, y, along + start[2]), goal_distance=goal)
+
+
+def from_walls(
+    name: str, walls: np.ndarray, start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Course:
+    """Free walls; `start` is x, y, heading."""
+    return Course(name, None, False, np.zeros((0, 2)), walls, (), start, 0.0, None)
+
+
+def _rounded(
+    name: str, corners: np.ndarray, angles: list[float], radii: list[float], closed: bool
+) -> tuple[np.ndarray, tuple[Turn, ...]]:
+    """Corner points with arcs put in, and the turns with their distances."""
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    trims = [r * math.tan(abs(a) / 2) for a, r in zip(angles, radii, strict=True)]
+    after = [*trims[1:], trims[0] if closed else 0.0]
+    if np.any(lengths < np.array(trims) + np.array(after) - 1e-9):
+        raise InputError(f"{name}: a radius_m is too large for the straights beside it")
+    points: list[np.ndarray] = []
+    turns = []
+    walked = 0.0
+    headings = np.arctan2(*np.diff(corners, axis=0).T[::-1])
+    for i, (angle, radius, trim) in enumerate(zip(angles, radii, trims, strict=True)):
+        if i:
+            walked += lengths[i - 1] - trims[i - 1] - trim
+        arc = abs(angle) * radius
+        if angle and (i or not closed):
+            turns.append(Turn(walked + arc / 2, angle))
+        if radius > 0 and angle:
+            into = headings[i] - angle
+            entry = corners[i] - trim * np.array([math.cos(into), math.sin(into)])
+            steps = max(1, math.ceil(abs(angle) / ARC_STEP))
+            chord = 2 * radius * math.sin(abs(angle) / steps / 2)
+            arc_points = [entry]
+            for k in range(steps):
+                bearing = into + angle * (k + 0.5) / steps
+                arc_points.append(
+                    arc_points[-1] + chord * np.array([math.cos(bearing), math.sin(bearing)])
+                )
+            # A closed course starts and ends in the middle of its last turn's arc, at its exit.
+            points.extend(arc_points[-1:] if i == 0 else arc_points)
+            first_arc = arc_points if i == 0 else None
+            if first_arc is not None:
+                closing = first_arc
+        else:
+            points.append(corners[i])
+            if i == 0:
+                closing = [corners[0]]
+        walked += arc if i else 0.0
+    if closed:
+        points.extend(closing)
+        walked += lengths[-1] - trims[-1] - trims[0]
+        turns.append(Turn(walked + abs(angles[0]) * radii[0] / 2, angles[0]))
+    else:
+        points.append(corners[-1])
+    return np.array(points), tuple(turns)
+
+
+def _offset(points: np.ndarray, closed: bool, aside: float) -> np.ndarray:
+    """The polyline moved aside to the left, its corners mitred, as wall segments."""
+    steps = np.diff(points, axis=0)
+    along = steps / np.hypot(*steps.T)[:, None]
+    before = np.roll(along, 1, axis=0) if closed else np.vstack([along[:1], along[:-1]])
+    normal = lambda d: np.stack([-d[:, 1], d[:, 0]], axis=1)  # noqa: E731  # used thrice
+    bisector = normal(along) + normal(before)
+    joint = 2 * bisector / np.sum(bisector**2, axis=1)[:, None]
+    shifted = points[:-1] + aside * joint
+    last = shifted[:1] if closed else points[-1:] + aside * normal(along[-1:])
+    ends = np.vstack([shifted, last])
+    return np.hstack([ends[:-1], ends[1:]])
+
+
+def place(course: Course, distance: float) -> tuple[float, float, float]:
+    """x, y and heading of the centre line at a distance (wrapped where the course is closed)."""
+    marks = course.marks
+    if course.closed:
+        distance = distance % course.length
+    i = int(np.clip(np.searchsorted(marks, distance, side="right") - 1, 0, len(marks) - 2))
+    step = course.line[i + 1] - course.line[i]
+    x, y = course.line[i] + step * (distance - marks[i]) / (marks[i + 1] - marks[i])
+    return float(x), float(y), float(math.atan2(step[1], step[0]))
+
+
+def progress(course: Course, xs: np.ndarray, ys: np.ndarray, last: float) -> np.ndarray:
+    """Unwrapped distance along the centre line of each position, followed on from `last`.
+
+    Each position goes to the nearest place of the line within one corridor's width of where the
+    one before it was, so that neither a neighbouring straight nor the start line confuses it.
+    """
+    if not len(course.line):
+        return np.zeros(len(xs))
+    marks, steps = course.marks[:-1], np.diff(course.line, axis=0)
+    lengths = np.hypot(*steps.T)
+    along = steps / lengths[:, None]
+    near = 1.5 * (course.width or 1.0)
+    found = np.empty(len(xs))
+    for n, (x, y) in enumerate(zip(xs, ys, strict=True)):
+        on = np.clip((np.array([x, y]) - course.line[:-1]) * along @ [1.0, 1.0], 0.0, lengths)
+        away = np.hypot(*(course.line[:-1] + on[:, None] * along - [x, y]).T)
+        where = marks + on
+        if course.closed:
+            where = where + np.round((last - where) / course.length) * course.length
+        away = np.where(np.abs(where - last) <= near, away, np.inf)
+        best = int(np.argmin(away))
+        last = float(where[best]) if np.isfinite(away[best]) else last
+        found[n] = last
+    return found
+
+
+def grip_speed(course: Course, car: Car) -> float:
+    """The highest speed (m/s) at which every corner of a corridor can be taken without sliding.
+
+    The car's centre swings from the outer side over the inner corner to the outer side, on one arc
+    per corner. With the free width w (the corridor's, less the car's width), an arc of radius R
+    about a corner of angle a fits if R (1 - cos(a/2)) <= w; and neighbouring arcs share the straight
+    between them: R (tan(a/2) + tan(b/2)) <= its length where the car drives. Then v² = mu g R, with mu of the
+    axle that lets go first in a steady turn, which carries its own share of the weight: the lesser.
+    """
+    if course.width is None or not course.turns:
+        return math.inf
+    free = course.width - float(car.body.width)
+    grip = min(
+        float(t.friction * (4 - 3 * t.sliding_ratio) / (3 - 2 * t.sliding_ratio) ** 2)
+        for t in (car.tires.front, car.tires.rear)
+    )
+    radius = min(free / (1 - math.cos(abs(t.angle) / 2)) for t in course.turns)
+    pairs = list(zip(course.turns, course.turns[1:], strict=False))
+    if course.closed:
+        first = course.turns[0]
+        pairs.append((course.turns[-1], first._replace(distance=first.distance + course.length)))
+    for one, two in pairs:
+        tangents = math.tan(abs(one.angle) / 2) + math.tan(abs(two.angle) / 2)
+        # Turns of one hand share their outer side, which is longer than the centre line.
+        outer = free / 2 * tangents if one.angle * two.angle > 0 else 0.0
+        radius = min(radius, (two.distance - one.distance + outer) / tangents)
+    return math.sqrt(grip * GRAVITY * radius)

@@ -1,0 +1,122 @@
+"""Courses in TOML files."""
+
+import importlib.resources
+import math
+from typing import Any
+
+import numpy as np
+
+from countersteer.car.files import read_toml
+from countersteer.car.parameter import unknown_key
+from countersteer.course.course import Course, from_segments, from_walls
+from countersteer.errors import InputError
+
+LIBRARY = importlib.resources.files("countersteer.course") / "library"
+
+KEYS = ("name", "width_m", "closed", "segments", "walls_m", "start", "goal")
+PLACES = {
+    "start": ("distance_m", "offset_m", "heading_deg"),
+    "goal": ("distance_m",),
+    "start of walls": ("x_m", "y_m", "heading_deg"),
+}
+
+
+def library() -> list[str]:
+    """Names of the courses that come with the package."""
+    return sorted(p.name.removesuffix(".toml") for p in LIBRARY.iterdir())
+
+
+def load_course(name: str) -> Course:
+    """A course from the library or a file. Raises `InputError` naming file and key."""
+    tables, where = read_toml(name, LIBRARY, "course")
+    return course_from_tables(tables, where)
+
+
+def course_from_tables(tables: dict[str, Any], where: str) -> Course:
+    """The course that the tables of a file describe."""
+    for key in tables:
+        if key not in KEYS:
+            raise unknown_key(where, key, dict.fromkeys(KEYS))
+    title = tables.get("name", where)
+    if not isinstance(title, str):
+        raise InputError(f"{where}: name must be a text")
+    if ("segments" in tables) == ("walls_m" in tables):
+        raise InputError(f"{where}: give either segments or walls_m")
+    if "walls_m" in tables:
+        start = _place(tables, "start", where, PLACES["start of walls"])
+        return from_walls(title, _walls(tables["walls_m"], where), (start[0], start[1], start[2]))
+    closed = tables.get("closed", False)
+    if not isinstance(closed, bool):
+        raise InputError(f"{where}: closed must be true or false")
+    start = _place(tables, "start", where, PLACES["start"])
+    goal = _place(tables, "goal", where, PLACES["goal"])[0] if "goal" in tables else None
+    width = _number(tables.get("width_m"), f"{where}: width_m", 0.05, 100)
+    segments = tables["segments"]
+    if not isinstance(segments, list) or not all(isinstance(s, dict) for s in segments):
+        raise InputError(f"{where}: segments must be a list of {{straight_m}} and {{turn_deg}}")
+    read = [_segment(s, f"{where}: segments[{i}]") for i, s in enumerate(segments)]
+    return from_segments(title, width, closed, read, (start[0], start[1], start[2]), goal)
+
+
+def _segment(segment: dict[str, Any], where: str) -> tuple[str, float, float]:
+    if set(segment) == {"straight_m"}:
+        return "straight", _number(segment["straight_m"], f"{where}.straight_m", 0.01, 1e4), 0.0
+    if set(segment) in ({"turn_deg"}, {"turn_deg", "radius_m"}):
+        angle = _number(segment["turn_deg"], f"{where}.turn_deg", -179, 179)
+        radius = _number(segment.get("radius_m", 0.0), f"{where}.radius_m", 0, 1e4)
+        return "turn", math.radians(angle), radius
+    raise InputError(f"{where} must be {{straight_m = …}} or {{turn_deg = …, radius_m = …}}")
+
+
+def _place(tables: dict[str, Any], key: str, where: str, known: tuple[str, ...]) -> list[float]:
+    table = tables.get(key, {})
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: {key} must be a table")
+    for name in table:
+        if name not in known:
+            raise unknown_key(where, f"{key}.{name}", {f"{key}.{k}": 0 for k in known})
+    return [
+        _number(table.get(name, 0.0), f"{where}: {key}.{name}", -1e4, 1e4)
+        * (math.pi / 180 if name.endswith("_deg") else 1.0)
+        for name in known
+    ]
+
+
+def _walls(lines: Any, where: str) -> np.ndarray:
+    """Polylines of points as segments."""
+    if not isinstance(lines, list) or not lines:
+        raise InputError(f"{where}: walls_m must be a list of lists of [x, y]")
+    walls = []
+    for i, line in enumerate(lines):
+        at = f"{where}: walls_m[{i}]"
+        if not isinstance(line, list) or len(line) < 2 or not all(
+            isinstance(p, list) and len(p) == 2 for p in line
+        ):
+            raise InputError(f"{at} must hold two or more points [x, y]")
+        points = [[_number(c, at, -1e5, 1e5) for c in p] for p in line]
+        walls.extend([[*a, *b] for a, b in zip(points, points[1:], strict=False)])
+    return np.array(walls)
+
+
+def _number(value: Any, where: str, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise InputError(f"{where} must be a number in [{low:g}, {high:g}], not {value!r}")
+    return float(value)
+
+
+def course_tables(course: Course) -> dict[str, Any]:
+    """What `run.toml` says of a course: enough to draw it and to drive it again."""
+    tables: dict[str, Any] = {
+        "name": course.name,
+        "closed": course.closed,
+        "start": dict(zip(("x_m", "y_m", "heading_rad"), course.start, strict=True)),
+        "start_distance_m": course.start_distance,
+        "walls_m": course.walls.tolist(),
+        "line_m": course.line.tolist(),
+        "turns": [{"distance_m": t.distance, "turn_deg": math.degrees(t.angle)} for t in course.turns],
+    }
+    if course.width is not None:
+        tables["width_m"] = course.width
+    if course.goal_distance is not None:
+        tables["goal_distance_m"] = course.goal_distance
+    return tables

@@ -1,0 +1,1 @@
+"""From readings to an estimate of the car's motion."""

@@ -1,0 +1,75 @@
+"""Dead reckoning: gyroscope, accelerometer and wheel encoder, integrated from a known start."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from countersteer.car.parameter import Scalar
+from countersteer.sensing.suite import Readings
+
+ROLLING = 1.0  # yaw rate (rad/s) under which the wheels are taken to roll, so that they tell speed
+TRUST = 0.25  # part of the difference to the wheels' speed that a report of theirs takes away
+FADE = 0.3  # s in which sideways speed is forgotten while the wheels roll
+
+
+class Estimate(NamedTuple):
+    """The motion of the car as far as it is known. SI, radians; pose of the centre of mass."""
+
+    x: Scalar
+    y: Scalar
+    heading: Scalar  # unwrapped
+    vx: Scalar  # along the body's axes
+    vy: Scalar
+    yaw_rate: Scalar
+
+
+class Memory(NamedTuple):
+    """The estimate, and the ticks of the reports that are already in it."""
+
+    estimate: Estimate
+    gyroscope: Scalar
+    accelerometer: Scalar
+    encoder: Scalar
+
+
+def initial_memory(pose: tuple[Scalar, Scalar, Scalar], dtype: jnp.dtype) -> Memory:
+    """At rest at a known pose."""
+    estimate = Estimate(*(jnp.asarray(value, dtype) for value in (*pose, 0, 0, 0)))
+    none = jnp.asarray(0, jnp.int32)
+    return Memory(estimate, none, none, none)
+
+
+def update(memory: Memory, readings: Readings, dt: float) -> Memory:
+    """Takes in what the readings have that is new.
+
+    dvx/dt = ax + r vy and dvy/dt = ay - r vx between reports of the accelerometer, the heading
+    between reports of the gyroscope. While the car hardly turns, the wheels' speed pulls vx to
+    itself, and vy fades.
+    """
+    old = memory.estimate
+    turned = jnp.maximum(readings.gyroscope.tick - memory.gyroscope, 0) * dt
+    rate = jnp.where(readings.gyroscope.tick > 0, readings.gyroscope.value, 0.0)
+    moved = jnp.maximum(readings.accel_x.tick - memory.accelerometer, 0) * dt
+    rolls = jnp.abs(rate) < ROLLING
+    vx = old.vx + moved * (readings.accel_x.value + rate * old.vy)
+    vy = old.vy + moved * (readings.accel_y.value - rate * old.vx)
+    vy = jnp.where(rolls, vy * jnp.exp(-moved / FADE), vy)
+    counted = rolls & (readings.wheel_speed.tick > memory.encoder)
+    wheel = readings.wheel_speed.value * jnp.where(vx < -0.2, -1.0, 1.0)
+    vx = vx + jnp.where(counted, TRUST * (wheel - vx), 0.0)
+    heading = old.heading + turned * rate
+    cosine, sine = jnp.cos(heading), jnp.sin(heading)
+    estimate = Estimate(
+        old.x + moved * (cosine * vx - sine * vy),
+        old.y + moved * (sine * vx + cosine * vy),
+        heading,
+        vx,
+        vy,
+        rate,
+    )
+    return Memory(
+        estimate,
+        jnp.maximum(readings.gyroscope.tick, memory.gyroscope),
+        jnp.maximum(readings.accel_x.tick, memory.accelerometer),
+        jnp.maximum(readings.wheel_speed.tick, memory.encoder),
+    )

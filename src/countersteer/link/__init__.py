@@ -1,0 +1,1 @@
+"""What lies between a driver and a car: rate, delay and loss."""

@@ -1,0 +1,1 @@
+"""Sensors: truth in, what the real part would report out."""

@@ -1,0 +1,49 @@
+"""Parts that read a number now and then: encoder, gyroscope, accelerometer, voltmeter."""
+
+import jax
+import jax.numpy as jnp
+
+from countersteer.car.car import Accelerometer, Encoder, Gyroscope, Voltmeter, Wheels
+from countersteer.car.parameter import Scalar
+
+
+def quantised(value: Scalar, step: Scalar) -> Scalar:
+    """The value on the grid of a converter; a step of 0 is no grid."""
+    return jnp.where(step > 0, jnp.round(value / jnp.maximum(step, 1e-12)) * step, value)
+
+
+def disc_speed(encoder: Encoder, wheels: Wheels, shaft: Scalar) -> Scalar:
+    """Speed of what the encoder sits on (rad/s)."""
+    if encoder.on == "shaft":
+        return shaft
+    return wheels[("front-left", "front-right", "rear-left", "rear-right").index(encoder.on)]
+
+
+def region(encoder: Encoder, angle: Scalar) -> Scalar:
+    """Number of the region under the eye at a disc's angle (rad)."""
+    return jnp.floor(angle * encoder.regions / jnp.pi)
+
+
+def wheel_speed(encoder: Encoder, radius: Scalar, counts: Scalar, time: Scalar) -> Scalar:
+    """Speed (m/s) for regions counted over a time: the step is pi R / (N time), never negative."""
+    return counts * jnp.pi / encoder.regions * radius / time
+
+
+def gyroscope(part: Gyroscope, yaw_rate: Scalar, noise: Scalar) -> Scalar:
+    """A reading (rad/s), given a standard normal `noise`: biased, noisy, saturated, quantised."""
+    read = jnp.clip(yaw_rate + part.bias + part.noise * noise, -part.reach, part.reach)
+    return quantised(read, part.resolution)
+
+
+def accelerometer(
+    part: Accelerometer, ax: Scalar, ay: Scalar, noise: jax.Array
+) -> tuple[Scalar, Scalar]:
+    """Readings forward and left (m/s²), given two standard normal numbers."""
+    x = jnp.clip(ax + part.bias_x + part.noise * noise[0], -part.reach, part.reach)
+    y = jnp.clip(ay + part.bias_y + part.noise * noise[1], -part.reach, part.reach)
+    return quantised(x, part.resolution), quantised(y, part.resolution)
+
+
+def voltmeter(part: Voltmeter, voltage: Scalar, noise: Scalar) -> Scalar:
+    """A reading (V), given a standard normal number."""
+    return quantised(voltage + part.noise * noise, part.resolution)

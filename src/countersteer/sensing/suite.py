@@ -1,0 +1,165 @@
+"""All sensors of a car on the shared clock."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from countersteer.car.car import Car
+from countersteer.car.parameter import Scalar
+from countersteer.sensing import parts, sonar
+from countersteer.world import drivetrain, motor
+from countersteer.world.state import Motion
+
+
+class Reading(NamedTuple):
+    """A sensor's last report; `tick` is -1 until there was one."""
+
+    value: Scalar
+    tick: Scalar
+
+
+class Readings(NamedTuple):
+    """The last report of every sensor. SI units, radians."""
+
+    sonar: tuple[Reading, ...]  # m, in the order of the car's mounts; inf: no echo
+    counts: Reading  # regions passed since the start
+    wheel_speed: Reading  # m/s, never negative
+    gyroscope: Reading  # rad/s
+    accel_x: Reading  # m/s²
+    accel_y: Reading
+    battery: Reading  # V
+
+
+class Periods(NamedTuple):
+    """Ticks between two reports."""
+
+    sonar: int
+    encoder: int
+    gyroscope: int
+    accelerometer: int
+    voltmeter: int
+
+
+class Memory(NamedTuple):
+    """What the sensors carry from tick to tick."""
+
+    readings: Readings
+    disc: Scalar  # angle of the encoder's disc, rad
+    counts: Scalar
+    counts_before: Scalar  # at the last report
+    vx: Scalar  # at the accelerometer's last report
+    vy: Scalar
+
+
+def periods(car: Car, dt: float) -> Periods:
+    """Each sensor's period in whole ticks, at least one."""
+    sensors = car.sensors
+    times = (
+        1 / sensors.sonar.rate,
+        sensors.encoder.update,
+        1 / sensors.gyroscope.rate,
+        1 / sensors.accelerometer.rate,
+        1 / sensors.voltmeter.rate,
+    )
+    return Periods(*(max(1, round(float(time) / dt)) for time in times))
+
+
+def initial_memory(car: Car, motion: Motion) -> Memory:
+    """Sensors that have not reported yet."""
+    zero = jnp.zeros((), jnp.result_type(motion.x))
+    none = Reading(zero, jnp.asarray(-1, jnp.int32))
+    no_echo = none._replace(value=zero + jnp.inf)
+    readings = Readings(tuple(no_echo for _ in car.sensors.sonar.mounts), *[none] * 6)
+    return Memory(readings, zero, zero, zero, motion.vx, motion.vy)
+
+
+def sense(
+    car: Car,
+    walls: jax.Array,
+    corners: jax.Array,
+    memory: Memory,
+    motion: Motion,
+    key: jax.Array,
+    tick: Scalar,
+    every: Periods,
+    dt: float,
+) -> Memory:
+    """The sensors after a tick. Noise is drawn from `key` and `tick`, once a reading."""
+    sensors, readings = car.sensors, memory.readings
+    shaft = drivetrain.driven_speed(car, motion.wheels)
+    turned = memory.disc + dt * parts.disc_speed(sensors.encoder, motion.wheels, shaft)
+    passed = jnp.abs(
+        parts.region(sensors.encoder, turned) - parts.region(sensors.encoder, memory.disc)
+    )
+    memory = memory._replace(disc=turned, counts=memory.counts + passed)
+    key = jax.random.fold_in(key, tick)
+    dtype = jnp.result_type(motion.x)
+
+    def ping(readings: Readings) -> Readings:
+        mounts = len(sensors.sonar.mounts)
+        if sensors.sonar.firing == "in-turn":
+            turn = (tick // every.sonar) % mounts
+            fires = tuple(jnp.where(turn == i, 1.0, 0.0) for i in range(mounts))
+        else:
+            fires = (jnp.asarray(1.0),) * mounts
+        pose = (motion.x, motion.y, motion.heading)
+        found = sonar.distances(sensors.sonar, walls, corners, pose, fires, key)
+        return readings._replace(
+            sonar=tuple(
+                Reading(
+                    jnp.where(f > 0, d, old.value).astype(dtype), jnp.where(f > 0, tick, old.tick)
+                )
+                for f, d, old in zip(fires, found, readings.sonar, strict=True)
+            )
+        )
+
+    def turn(readings: Readings) -> Readings:
+        noise = jax.random.normal(jax.random.fold_in(key, 1), dtype=dtype)
+        return readings._replace(
+            gyroscope=Reading(parts.gyroscope(sensors.gyroscope, motion.yaw_rate, noise), tick)
+        )
+
+    def weigh(readings: Readings) -> Readings:
+        noise = jax.random.normal(jax.random.fold_in(key, 2), (2,), dtype=dtype)
+        time = every.accelerometer * dt
+        ax = (motion.vx - memory.vx) / time - motion.yaw_rate * motion.vy
+        ay = (motion.vy - memory.vy) / time + motion.yaw_rate * motion.vx
+        x, y = parts.accelerometer(sensors.accelerometer, ax, ay, noise)
+        return readings._replace(accel_x=Reading(x, tick), accel_y=Reading(y, tick))
+
+    def count(readings: Readings) -> Readings:
+        radius = car.tires.rear.radius if "rear" in sensors.encoder.on else car.tires.front.radius
+        speed = parts.wheel_speed(
+            sensors.encoder, radius, memory.counts - memory.counts_before, every.encoder * dt
+        )
+        return readings._replace(
+            counts=Reading(memory.counts, tick), wheel_speed=Reading(speed, tick)
+        )
+
+    def probe(readings: Readings) -> Readings:
+        noise = jax.random.normal(jax.random.fold_in(key, 3), dtype=dtype)
+        voltage = motor.drive(
+            car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, shaft
+        ).battery_voltage
+        return readings._replace(
+            battery=Reading(parts.voltmeter(sensors.voltmeter, voltage, noise), tick)
+        )
+
+    counted = tick % every.encoder == 0
+    weighed = tick % every.accelerometer == 0
+    for due, report in (
+        (tick % every.sonar == 0, ping) if sensors.sonar.mounts else (None, ping),
+        (tick % every.gyroscope == 0, turn),
+        (weighed, weigh),
+        (counted, count),
+        (tick % every.voltmeter == 0, probe),
+    ):
+        if due is not None:
+            readings = jax.lax.cond(due, report, lambda same: same, readings)
+    return memory._replace(
+        readings=readings,
+        counts_before=jnp.where(counted, memory.counts, memory.counts_before),
+        vx=jnp.where(weighed, motion.vx, memory.vx),
+        vy=jnp.where(weighed, motion.vy, memory.vy),
+    )

@@ -1,0 +1,320 @@
+"""The closed loop: a driver, a link, a car and its sensors in a world.
+
+    course ─┐
+    car ────┤                                      ┌─► record
+            ▼                                      │
+      world.step ─► sensors ─► link ─► estimate ───┴► driver ─► link ─┐
+            ▲                                                         │
+            └───────────────────── command ◄──────────────────────────┘
+
+Time is an integer tick. In each tick the driver (when its time has come) acts on what it has heard,
+the link carries the command, the world takes one step, and the sensors look at where it led.
+"""
+
+import dataclasses
+import math
+import os
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.car import Car, Wheels
+from countersteer.car.parameter import Scalar
+from countersteer.course.course import Course
+from countersteer.drivers.driver import Driver, Heard, Observation
+from countersteer.estimation import dead_reckoning
+from countersteer.estimation.dead_reckoning import Estimate
+from countersteer.link.link import ONBOARD, Channel, Link, exchange, initial_channel
+from countersteer.sensing import sonar, suite
+from countersteer.sensing.suite import Reading, Readings
+from countersteer.world import drivetrain, motor, planar
+from countersteer.world.planar import Command
+from countersteer.world.state import Motion, State
+
+PIECE = 0.5  # s of car time that are scanned at once; records are flushed between pieces
+
+
+class Plan(NamedTuple):
+    """What a program is compiled for: periods in ticks, and what is wired to what. Hashable."""
+
+    dt: float
+    control: int
+    telemetry: int
+    delay: int
+    timeout: int  # 0: none
+    onboard: bool
+    truth: bool  # the estimate is the state itself
+    sensors: suite.Periods
+
+
+class Surroundings(NamedTuple):
+    """What stays the same during a drive."""
+
+    walls: jax.Array  # (n, 4), padded with NaN
+    corners: jax.Array  # (2n, 3), from `sonar.edges`
+    key: jax.Array
+    loss: Scalar
+
+
+class Loop(NamedTuple):
+    """Everything between two ticks."""
+
+    tick: Scalar
+    state: State
+    sensors: suite.Memory
+    estimate: dead_reckoning.Memory
+    command: Command  # the driver's last
+    up: Channel | None
+    down: Channel | None
+    memory: Any  # the driver's
+
+
+class Record(NamedTuple):
+    """What is kept of a tick, at its end."""
+
+    tick: Scalar
+    motion: Motion
+    voltage: Scalar
+    command: Command  # that the car ran in this tick
+    fresh: Scalar  # whether that command was a new one
+    readings: Readings
+    turn: Scalar  # turns that the driver has begun
+    wall_contacts: Scalar
+    rolled_over: Scalar
+    forces: Wheels
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulator:
+    """A car, driven. `run` yields the record of a drive in pieces of half a second.
+
+    `course` may be None: open floor. `car` is what is simulated; a driver knows only what it was
+    made for. The precision is that of the car's leaves: 64-bit leaves run in 64 bits.
+    `estimate` is "filter" (dead reckoning from the sensors) or "truth".
+    """
+
+    course: Course | None
+    car: Car
+    driver: Driver
+    link: Link = ONBOARD
+    estimate: str = "filter"
+    dt: float = 0.001
+    seed: int = 0
+    charge: float = 1.0
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start: tuple[float, float, float] | None = None  # instead of the course's
+
+    def plan(self) -> Plan:
+        """Periods in whole ticks, at least one each."""
+        ticks = lambda time: max(1, round(time / self.dt))  # noqa: E731  # used twice
+        timeout = self.link.timeout
+        return Plan(
+            self.dt,
+            ticks(self.link.control_period),
+            ticks(self.link.telemetry_period),
+            round(self.link.delay / self.dt),
+            0 if math.isinf(timeout) else ticks(timeout),
+            self.link.onboard,
+            self.estimate == "truth",
+            suite.periods(self.car, self.dt),
+        )
+
+    def run(self, longest: float) -> Iterator[Record]:
+        """Drives for at most so many seconds. Each record has a leading axis of ticks.
+
+        Whoever reads the pieces may stop when the goal is reached.
+        """
+        wide = np.asarray(self.car.body.mass).dtype == np.float64
+        plan = self.plan()
+        ticks = max(1, round(PIECE / self.dt / plan.control)) * plan.control
+        with jax.enable_x64(wide):
+            around, loop = self.begin(plan)
+            scanned = not jax.tree_util.all_leaves([self.driver])
+        for _ in range(math.ceil(longest / (ticks * self.dt))):
+            with jax.enable_x64(wide):
+                if scanned:
+                    loop, record = scan(plan, ticks, self.car, around, self.driver, loop)
+                else:
+                    loop, record = self._stepped(plan, ticks, around, loop)
+                record = jax.tree.map(np.asarray, record)
+            yield record
+
+    def begin(self, plan: Plan) -> tuple[Surroundings, Loop]:
+        """The loop before its first tick."""
+        dtype = np.asarray(self.car.body.mass).dtype
+        pose = self.start or (self.course.start if self.course else (0.0, 0.0, 0.0))
+        walls = padded(self.course.walls if self.course else np.zeros((0, 4)), dtype)
+        key, driver_key = jax.random.split(jax.random.key(self.seed))
+        around = Surroundings(walls, sonar.edges(walls), key, jnp.asarray(self.link.loss, dtype))
+        state = planar.initial_state(self.car, self.dt, pose, self.velocity, self.charge)
+        sensors = suite.initial_memory(self.car, state.motion)
+        zero = jnp.zeros((), dtype)
+        still = Command(zero, zero)
+        up = down = None
+        if not plan.onboard:
+            up = initial_channel(still, plan.control, plan.delay)
+            down = initial_channel(sensors.readings, plan.telemetry, plan.delay)
+        estimate = dead_reckoning.initial_memory(pose, dtype)
+        memory = self.driver.reset(driver_key)
+        if not jax.tree_util.all_leaves([self.driver]):
+            memory = jax.tree.map(_strong, memory)
+        return around, Loop(
+            jnp.asarray(0, jnp.int32), state, sensors, estimate, still, up, down, memory
+        )
+
+    def _stepped(
+        self, plan: Plan, ticks: int, around: Surroundings, loop: Loop
+    ) -> tuple[Loop, Record]:
+        """The same as `scan` for a driver that is called from Python."""
+        records = []
+        memory = loop.memory
+        loop = loop._replace(memory=())
+        for _ in range(ticks // plan.control):
+            loop, observation = jitted_observe(plan, loop)
+            command, memory = self.driver.act(memory, jax.tree.map(np.asarray, observation))
+            loop = loop._replace(command=_like(command, loop.command))
+            loop, record = hold(plan, self.car, around, loop)
+            turn = np.full(plan.control, getattr(memory, "turn", 0))
+            records.append(jax.tree.map(np.asarray, record)._replace(turn=turn))
+        whole = jax.tree.map(lambda *pieces: np.concatenate(pieces), *records)
+        return loop._replace(memory=memory), whole
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def scan(
+    plan: Plan, ticks: int, car: Car, around: Surroundings, driver: Driver, loop: Loop
+) -> tuple[Loop, Record]:
+    """So many ticks with a driver that JAX can trace."""
+
+    def act(loop: Loop) -> Loop:
+        loop, observation = observe(plan, loop)
+        command, memory = driver.act(loop.memory, observation)
+        memory = jax.tree.map(_like, memory, loop.memory)
+        return loop._replace(command=jax.tree.map(_like, command, loop.command), memory=memory)
+
+    def tick(loop: Loop, _: None) -> tuple[Loop, Record]:
+        if plan.control == 1:
+            loop = act(loop)
+        else:
+            loop = jax.lax.cond(loop.tick % plan.control == 0, act, lambda same: same, loop)
+        return advance(plan, car, around, loop)
+
+    return jax.lax.scan(tick, loop, None, length=ticks)
+
+
+@partial(jax.jit, static_argnums=0)
+def hold(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loop, Record]:
+    """The ticks of one control period with the command as it is."""
+    return jax.lax.scan(
+        lambda carry, _: advance(plan, car, around, carry), loop, None, length=plan.control
+    )
+
+
+def observe(plan: Plan, loop: Loop) -> tuple[Loop, Observation]:
+    """What the driver is told at this tick: the readings that it has heard, and the estimate."""
+    readings = loop.sensors.readings if loop.down is None else loop.down.latest
+    memory = dead_reckoning.update(loop.estimate, readings, plan.dt)
+    motion = loop.state.motion
+    known = memory.estimate
+    if plan.truth:
+        known = Estimate(
+            motion.x, motion.y, motion.heading, motion.vx, motion.vy, motion.yaw_rate
+        )
+
+    def heard(reading: Reading) -> Heard:
+        age = plan.dt * (loop.tick - reading.tick).astype(jnp.result_type(motion.x))
+        return Heard(reading.value, jnp.where(reading.tick >= 0, age, jnp.inf))
+
+    told = jax.tree.map(heard, readings, is_leaf=lambda node: isinstance(node, Reading))
+    time = plan.dt * loop.tick.astype(jnp.result_type(motion.x))
+    return loop._replace(estimate=memory), Observation(time, *told, known)
+
+
+jitted_observe = jax.jit(observe, static_argnums=0)
+
+
+def advance(
+    plan: Plan, car: Car, around: Surroundings, loop: Loop
+) -> tuple[Loop, Record]:
+    """One tick: command over the link, world, sensors, readings over the link."""
+    command, fresh = loop.command, loop.tick % plan.control == 0
+    up, down = loop.up, loop.down
+    if up is not None and down is not None:
+        lost = jax.random.uniform(
+            jax.random.fold_in(jax.random.fold_in(around.key, loop.tick), 7), (2,)
+        ) < around.loss
+        up = exchange(up, command, lost[0], loop.tick, plan.control, plan.delay)
+        fresh = up.arrived == loop.tick
+        silent = loop.tick - up.arrived > plan.timeout
+        stops = silent & (up.arrived >= 0) if plan.timeout else jnp.asarray(False)
+        command = up.latest._replace(throttle=jnp.where(stops, 0.0, up.latest.throttle))
+        fresh = fresh | (stops & (loop.tick - up.arrived == plan.timeout + 1))
+    state = planar.step(car, around.walls, loop.state, command, loop.tick, plan.dt)
+    after = loop.tick + 1
+    sensors = suite.sense(
+        car,
+        around.walls,
+        around.corners,
+        loop.sensors,
+        state.motion,
+        around.key,
+        after,
+        plan.sensors,
+        plan.dt,
+    )
+    if down is not None:
+        down = exchange(down, sensors.readings, lost[1], after, plan.telemetry, plan.delay)
+    motion = state.motion
+    voltage = motor.drive(
+        car.motor,
+        car.drivetrain,
+        car.battery,
+        motion.duty,
+        motion.charge,
+        drivetrain.driven_speed(car, motion.wheels),
+    ).battery_voltage
+    record = Record(
+        after,
+        motion,
+        voltage,
+        command,
+        fresh,
+        sensors.readings,
+        jnp.asarray(getattr(loop.memory, "turn", 0)),
+        state.wall_contacts,
+        state.rolled_over,
+        planar.forces(car, motion),
+    )
+    return loop._replace(tick=after, state=state, sensors=sensors, up=up, down=down), record
+
+
+def padded(walls: np.ndarray, dtype: np.dtype) -> jax.Array:
+    """Walls with rows of NaN up to a power of two, so that like courses share a program."""
+    rows = max(8, 1 << math.ceil(math.log2(max(len(walls), 1))))
+    full = np.full((rows, 4), np.nan, dtype)
+    full[: len(walls)] = walls
+    return jnp.asarray(full)
+
+
+def _strong(leaf: Any) -> jax.Array:
+    """An array whose type does not depend on what it is added to."""
+    leaf = jnp.asarray(leaf)
+    return jax.lax.convert_element_type(leaf, leaf.dtype)
+
+
+def _like(new: Any, old: Any) -> Any:
+    """What a driver gave, with the type that the loop carries."""
+    return jax.tree.map(lambda n, o: jnp.asarray(n, o.dtype), new, old)
+
+
+def keep_programs() -> None:
+    """Keep compiled programs in the user's cache, so that the next process starts at once."""
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    jax.config.update("jax_compilation_cache_dir", str(Path(home) / "countersteer" / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
