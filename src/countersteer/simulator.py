@@ -75,13 +75,13 @@ class Loop(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is kept of a tick, at its end."""
+    """What is kept of a tick: the state at its start, and the command that the car runs in it."""
 
     tick: Scalar
     motion: Motion
     voltage: Scalar
-    command: Command  # that the car ran in this tick
-    fresh: Scalar  # whether that command was a new one
+    command: Command
+    fresh: Scalar  # whether that command is a new one
     readings: Readings
     turn: Scalar  # turns that the driver has begun
     wall_contacts: Scalar
@@ -269,28 +269,28 @@ def advance(
     )
     if down is not None:
         down = exchange(down, sensors.readings, lost[1], after, plan.telemetry, plan.delay)
-    motion = state.motion
-    voltage = motor.drive(
-        car.motor,
-        car.drivetrain,
-        car.battery,
-        motion.duty,
-        motion.charge,
-        drivetrain.driven_speed(car, motion.wheels),
-    ).battery_voltage
+    before = loop.state.motion
     record = Record(
-        after,
-        motion,
-        voltage,
+        loop.tick,
+        before,
+        voltage(car, before),
         command,
         fresh,
-        sensors.readings,
+        loop.sensors.readings,
         jnp.asarray(getattr(loop.memory, "turn", 0)),
-        state.wall_contacts,
-        state.rolled_over,
-        planar.forces(car, motion),
+        loop.state.wall_contacts,
+        loop.state.rolled_over,
+        planar.forces(car, before),
     )
     return loop._replace(tick=after, state=state, sensors=sensors, up=up, down=down), record
+
+
+def voltage(car: Car, motion: Motion) -> Scalar:
+    """The battery's voltage under load (V)."""
+    driven = drivetrain.driven_speed(car, motion.wheels)
+    return motor.drive(
+        car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven
+    ).battery_voltage
 
 
 def padded(walls: np.ndarray, dtype: np.dtype) -> jax.Array:

@@ -154,3 +154,28 @@ def save_car(car: Car, path: Path, source: dict[str, str]) -> None:
     path.write_text(tomli_w.dumps({"source": source, **car_tables(car)}))
 
 
+
+
+def parameter_lines(part: Any = None, path: str = "") -> list[str]:
+    """Every parameter: path, range with unit, default, meaning, source of the default."""
+    part = Car() if part is None else part
+    lines = []
+    for key, (name, declared) in declarations(type(part)).items():
+        value = write_value(declared, getattr(part, name))
+        if declared.choices:
+            span = " | ".join(declared.choices)
+        else:
+            span = "{:g} … {:g}".format(
+                *(write_value(declared, bound) for bound in (declared.low, declared.high))
+            )
+            value = f"{value:g}"
+        lines.append(
+            f"{path}{key} = {value}  [{span}]  {declared.meaning} (default: {declared.source})"
+        )
+    for field in dataclasses.fields(part):
+        inner = getattr(part, field.name)
+        if dataclasses.is_dataclass(inner):
+            lines += parameter_lines(inner, f"{path}{field.name}.")
+        elif field.name == "mounts":
+            lines += parameter_lines(Mount(), f"{path}mounts.NAME.")
+    return lines

@@ -10,7 +10,6 @@ from countersteer.car.car import GRAVITY, Car
 from countersteer.errors import InputError
 
 ARC_STEP = math.radians(5)  # of the chords that stand for a rounded corner
-ARRIVAL = 0.02  # m before the goal line that count as having reached it
 
 
 class Turn(NamedTuple):

@@ -15,6 +15,7 @@ from countersteer.drivers.driver import Command, Observation
 from countersteer.drivers.straighten import Straighten
 
 STRAIGHT, SPIN, CATCH = 0, 1, 2
+SPEED = 1.9  # m/s, unless another is asked for
 
 
 class Memory(NamedTuple):
@@ -136,14 +137,14 @@ class DriftTurn:
         )
 
 
-def drift_turn(course: Course, car: Car, speed: float, laps: int = 1) -> DriftTurn:
-    """For a course and a nominal car."""
+def drift_turn(course: Course, car: Car, speed: float | None = None, laps: int = 1) -> DriftTurn:
+    """For a course and a nominal car; `speed` (m/s) is what it brings to a turn."""
     turns = course.turns_ahead(laps)
     marks = [course.start_distance] + [t.distance for t in turns]
     names = car.sensors.sonar.mount_names
     front = names.index("front")
     return DriftTurn(
-        straight=straighten.straighten(course, car, speed),
+        straight=straighten.straighten(course, car, SPEED if speed is None else speed),
         angles=np.array([t.angle for t in turns] + [0.0]),
         gaps=np.append(np.diff(marks), np.inf),
         front_x=car.sensors.sonar.mounts[front].x,

@@ -14,6 +14,9 @@ from countersteer.drivers.driver import Command, Observation
 
 
 
+SPEED = 1.5  # m/s, unless another is asked for
+
+
 class Memory(NamedTuple):
     """Where the car is in its corridor."""
 
@@ -95,8 +98,9 @@ class Straighten:
         )
 
 
-def straighten(course: Course, car: Car, speed: float) -> Straighten:
-    """For a course and a nominal car."""
+def straighten(course: Course, car: Car, speed: float | None = None) -> Straighten:
+    """For a course and a nominal car; `speed` in m/s."""
+    speed = SPEED if speed is None else speed
     names = car.sensors.sonar.mount_names
     left, right = names.index("left"), names.index("right")
     mounts = car.sensors.sonar.mounts

@@ -1,0 +1,399 @@
+"""The command line: parse, call, print."""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from countersteer import __version__
+from countersteer.errors import InputError
+
+if TYPE_CHECKING:
+    from countersteer.car.car import Car
+    from countersteer.course.course import Course
+    from countersteer.drivers.driver import Driver
+
+DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+DRIVERS = ("drift-turn", "straighten")
+LIBRARIES = {"cars": "car", "courses": "course"}
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> Any:
+        """Raises `InputError` with what argparse found."""
+        raise InputError(f"{message} (see {self.prog} --help)")
+
+
+def number(low: float, high: float, kind: type = float) -> Callable[[str], Any]:
+    """A number within bounds."""
+
+    def read(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"must be a number in [{low:g}, {high:g}], not {text}")
+        return value
+
+    return read
+
+
+def parser() -> Parser:
+    """All verbs with their options."""
+    top = Parser(prog="countersteer", description="Makes a radio-controlled car drift by itself.")
+    top.add_argument("--version", action="version", version=f"countersteer {__version__}")
+    verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
+
+    def verb(name: str, does: str, run: Callable[[argparse.Namespace], int]) -> Parser:
+        made = verbs.add_parser(name, help=does, description=does)
+        made.add_argument("--json", action="store_true", help="one JSON object, nothing else")
+        made.set_defaults(run=run)
+        return made
+
+    def physics(made: Parser, car: str | None) -> None:
+        default = f"default {car}" if car else "default the run's own, else rx7"
+        made.add_argument("--car", default=car, help=f"library name or .toml file ({default})")
+        made.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="PATH=VALUE",
+            help="override a parameter of the car, such as battery.wear=0.5 (repeatable; "
+            "'countersteer list parameters' has them all)",
+        )
+        made.add_argument("--seed", type=number(0, 2**31 - 1, int), default=0, help="default 0")
+        made.add_argument(
+            "--dt",
+            type=number(1e-5, 0.02),
+            default=0.001,
+            metavar="S",
+            help="physics step in seconds (default 0.001)",
+        )
+        made.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
+
+    drive = verb("drive", "one closed-loop drive over a course", run_drive)
+    drive.add_argument("course", metavar="COURSE", help="library name or .toml file")
+    drive.add_argument(
+        "--driver",
+        default="drift-turn",
+        help=f"{', '.join(DRIVERS)}, or a commands.csv (default drift-turn)",
+    )
+    physics(drive, "rx7")
+    drive.add_argument("--laps", type=number(1, 1000, int), default=1, metavar="N")
+    drive.add_argument(
+        "--speed-mps",
+        type=number(0.2, 20),
+        default=None,
+        metavar="V",
+        help="speed that the driver is asked to bring to a turn (default the driver's)",
+    )
+    drive.add_argument(
+        "--battery", type=number(0, 1), default=1.0, metavar="F", help="charge, 0 to 1 (default 1)"
+    )
+    drive.add_argument("--link", choices=("onboard", "radio"), default="onboard")
+    drive.add_argument(
+        "--estimate",
+        choices=("filter", "truth"),
+        default="filter",
+        help="what the driver knows of its motion (default filter: from the sensors)",
+    )
+
+    replay = verb("replay", "commands in, motion out; or a log against the simulator", run_replay)
+    replay.add_argument("source", type=Path, metavar="COMMANDS_OR_RUN")
+    physics(replay, None)
+    replay.add_argument(
+        "--initial", default="", metavar="STATES", help='such as "vx_mps=2,yaw_rate_radps=1"'
+    )
+    replay.add_argument("--compare", action="store_true", help="measured against simulated")
+    replay.add_argument(
+        "--horizon", default="1.0", metavar="S|run", help="of the comparison (default 1.0 s)"
+    )
+
+    take = verb("import", "other people's logs to run folders", run_import)
+    take.add_argument("format", choices=("dart",), metavar="FORMAT", help="dart")
+    take.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    take.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+    lists = verb("list", "what there is by name", run_list)
+    lists.add_argument("what", choices=("cars", "courses", "drivers", "parameters"))
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a verb; returns the exit status."""
+    try:
+        options = parser().parse_args(arguments)
+        return int(options.run(options))
+    except InputError as error:
+        print(f"countersteer: {' '.join(str(error).split())}", file=sys.stderr)
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        print("countersteer: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except OSError as error:
+        name = f"{error.filename}: " if error.filename else ""
+        print(f"countersteer: {name}{error.strerror or error}", file=sys.stderr)
+        return FAILED
+
+
+def run_drive(options: argparse.Namespace) -> int:
+    """`drive`."""
+    from countersteer.car.files import load_car
+    from countersteer.course.files import load_course
+    from countersteer.link.link import LINKS
+    from countersteer.simulator import Simulator
+
+    course, car = load_course(options.course), load_car(options.car, options.set)
+    driver = make_driver(options.driver, course, load_car(options.car), options.speed_mps, options.laps)
+    name = Path(options.driver).stem if options.driver.endswith(".csv") else options.driver
+    simulator = Simulator(
+        course,
+        car,
+        driver,
+        LINKS[options.link],
+        options.estimate,
+        options.dt,
+        options.seed,
+        options.battery,
+    )
+    # A lap at a crawl still ends.
+    longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
+    return record(options, simulator, name, course.name, longest, options.laps)
+
+
+def run_replay(options: argparse.Namespace) -> int:
+    """`replay`."""
+    from countersteer.car.files import load_car
+    from countersteer.drivers.replay import Replay
+    from countersteer.runs.files import read_commands
+    from countersteer.runs.run import read_run
+    from countersteer.simulator import Simulator
+
+    run = read_run(options.source) if options.source.is_dir() else None
+    if run is None and not options.source.exists():
+        raise InputError(f"{options.source}: no such run folder or commands.csv")
+    if run is not None and options.car is None and run.car is not None and not options.set:
+        car, name = run.car, str(run.about.get("car_name", "its own car"))
+    else:
+        name = options.car or (str(run.about.get("car_name", "rx7")) if run else "rx7")
+        car = load_car(name, options.set)
+    if options.compare:
+        if run is None:
+            raise InputError("--compare needs a run folder, such as import makes")
+        return run_compare(options, run, car)
+    commands = run.commands if run else read_commands(options.source)
+    pose, velocity = read_initial(options.initial)
+    if run is not None and not options.initial:
+        begin = run.about.get("course", {}).get("start") or run.about.get("start")
+        if begin:
+            pose = (begin["x_m"], begin["y_m"], begin["heading_rad"])
+        first = run.about.get("initial", {})
+        velocity = (
+            first.get("vx_mps", 0.0),
+            first.get("vy_mps", 0.0),
+            first.get("yaw_rate_radps", 0.0),
+        )
+    charge = float(run.about.get("battery_charge", 1.0)) if run else 1.0
+    driver = Replay(
+        times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
+    )
+    simulator = Simulator(
+        None,
+        car,
+        driver,
+        dt=options.dt,
+        seed=options.seed,
+        start=pose,
+        velocity=velocity,
+        charge=charge,
+    )
+    times = commands["time_s"]
+    last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
+    return record(options, simulator, "replay", options.source.stem, float(times[-1]) + last, 1, name)
+
+
+def record(
+    options: argparse.Namespace,
+    simulator: Any,
+    driver: str,
+    place: str,
+    longest: float,
+    laps: int,
+    car_name: str | None = None,
+) -> int:
+    """Drives, writes the run's folder with its pictures, and prints what came of it."""
+    from countersteer.evaluation.drive import about_run, drive
+    from countersteer.runs.writer import new_folder
+    from countersteer.simulator import keep_programs
+    from countersteer.viewing.picture import draw_picture
+
+    keep_programs()
+    about = about_run(simulator, driver, car_name or options.car, laps)
+    folder = new_folder(options.out, f"{Path(place).stem}-{driver}")
+    with Progress(options.json) as progress:
+        result, view = drive(simulator, folder, about, laps, longest, progress.show)
+    draw_picture(view, folder / "report.png")
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+    else:
+        print_result(result, folder)
+    if result["status"] == "interrupted":
+        return INTERRUPTED
+    return DONE if result["success"] or result["status"] == "done" else FAILED
+
+
+def run_compare(options: argparse.Namespace, run: Any, car: "Car") -> int:
+    """`replay --compare`."""
+    from countersteer.evaluation.compare import compare, draw_comparison
+    from countersteer.simulator import keep_programs
+
+    keep_programs()
+    horizon = None if options.horizon == "run" else read_horizon(options.horizon)
+    result, series = compare(run, car, horizon, options.dt)
+    out = options.out or run.path
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "compare.json").write_text(json.dumps(result, indent=1) + "\n")
+    draw_comparison(series, out / "compare.png")
+    if options.json:
+        print(json.dumps(result))
+        return DONE
+    print(f"{result['windows']} windows of {result['horizon_s']:g} s; error at the end of a window:")
+    for name, error in result["median_abs_error"].items():
+        nothing = result["persistence"]["median_abs_error"][name]
+        print(f"  {name:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")
+    print(f"picture: {out / 'compare.png'}")
+    return DONE
+
+
+def run_import(options: argparse.Namespace) -> int:
+    """`import`."""
+    from countersteer.runs.dart import import_dart
+
+    results = []
+    for file in options.files:
+        results.append(import_dart(file, options.out))
+        if not options.json:
+            print(f"{file.name} -> {options.out / file.stem}")
+    if options.json:
+        print(json.dumps({"runs": results}))
+    return DONE
+
+
+def run_list(options: argparse.Namespace) -> int:
+    """`list`."""
+    if options.what == "parameters":
+        from countersteer.car.files import parameter_lines
+
+        lines = parameter_lines()
+    elif options.what == "drivers":
+        lines = list(DRIVERS)
+    elif options.what == "cars":
+        from countersteer.car.files import library
+
+        lines = library()
+    else:
+        from countersteer.course.files import library as courses
+
+        lines = courses()
+    print(json.dumps({options.what: lines}) if options.json else "\n".join(lines))
+    return DONE
+
+
+def make_driver(
+    name: str, course: "Course", car: "Car", speed: float | None, laps: int
+) -> "Driver":
+    """A driver from the library, or one that replays a `commands.csv`."""
+    from countersteer.drivers.drift_turn import drift_turn
+    from countersteer.drivers.replay import Replay
+    from countersteer.drivers.straighten import straighten
+    from countersteer.runs.files import read_commands
+
+    if name.endswith(".csv"):
+        commands = read_commands(Path(name))
+        return Replay(
+            times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
+        )
+    if name == "drift-turn":
+        return drift_turn(course, car, speed, laps)
+    if name == "straighten":
+        return straighten(course, car, speed)
+    raise InputError(f"no driver {name}: give one of {', '.join(DRIVERS)}, or a commands.csv")
+
+
+INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
+
+
+def read_initial(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Pose and velocity from `vx_mps=2,…`; what is not named is 0."""
+    values = dict.fromkeys(INITIAL, 0.0)
+    for part in filter(None, text.split(",")):
+        name, _, value = part.strip().partition("=")
+        if name not in values:
+            raise InputError(f"--initial: unknown state {name}; known: {', '.join(INITIAL)}")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise InputError(f"--initial: {name} must be a number, not {value!r}") from None
+        if not math.isfinite(values[name]):
+            raise InputError(f"--initial: {name} must be finite")
+    x, y, heading, vx, vy, yaw_rate = values.values()
+    return (x, y, heading), (vx, vy, yaw_rate)
+
+
+def read_horizon(text: str) -> float:
+    """The horizon of a comparison in seconds."""
+    try:
+        return float(number(0.05, 600)(text))
+    except argparse.ArgumentTypeError as error:
+        raise InputError(f"--horizon {error}, or the word run") from None
+
+
+class Progress:
+    """A progress bar on a terminal; nothing elsewhere, and nothing with `--json`."""
+
+    def __init__(self, quiet: bool) -> None:
+        """Quiet shows nothing."""
+        self._quiet = quiet or not sys.stderr.isatty()
+        self._bar: Any = None
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def show(self, done: float, of: float) -> None:
+        """Moves the bar."""
+        if self._quiet:
+            return
+        if self._bar is None:
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=of, leave=False, bar_format="{l_bar}{bar}| {elapsed}")
+        self._bar.n = min(done, of)
+        self._bar.refresh()
+
+
+def print_result(result: dict[str, Any], folder: Path) -> None:
+    """The summary for a person."""
+    lap = f" in {result['lap_time_s']:.2f} s" if result["lap_time_s"] else ""
+    print(f"{result['status']}{lap}, {result['wall_contacts']} wall contacts")
+    for i, turn in enumerate(result["turns"], start=1):
+        print(
+            f"  turn {i}: in at {turn['entry_speed_mps']:.2f} m/s, "
+            f"sideslip {turn['peak_sideslip_deg']:.0f}°, "
+            f"yaw rate {turn['peak_yaw_rate_degps']:.0f} °/s, "
+            f"out {turn['heading_error_deg']:+.1f}° off after {turn['duration_s']:.2f} s"
+        )
+    print(f"report: {folder / 'report.html'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

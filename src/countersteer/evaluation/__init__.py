@@ -1,0 +1,1 @@
+"""What a drive was worth: turns, laps, errors against a log."""

@@ -1,0 +1,266 @@
+"""One drive from start to goal, recorded as it goes."""
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from countersteer.car.car import wheel_positions
+from countersteer.car.files import car_tables
+from countersteer.course.files import course_tables
+from countersteer.evaluation.turns import Judge, sideslip, summary
+from countersteer.runs.files import TRUTH
+from countersteer.runs.writer import WHEELS, Rows, RunWriter
+from countersteer.simulator import Record, Simulator
+from countersteer.viewing.report import report_html
+
+COUNTS = ("turn", "wall_contacts")
+TRUTH_PERIOD = 0.005  # s between two rows of truth.csv
+VIEW_PERIOD = 0.01  # s between two samples of the report
+
+
+@dataclasses.dataclass(frozen=True)
+class Log:
+    """A piece of a drive, thinned to what is written and shown."""
+
+    rows: Rows
+    truth: dict[str, np.ndarray]  # columns of truth.csv, and turn, wall_contacts
+    view: dict[str, np.ndarray]  # commands and contacts at the truth's times
+    echoes: tuple[tuple[np.ndarray, np.ndarray], ...]  # times and distances by sonar mount
+
+    @staticmethod
+    def read(
+        record: Record, simulator: Simulator, judge: Judge, longest: float
+    ) -> tuple["Log", str | None]:
+        """The piece, cut off where the drive ends in it, and how it ended there if it did."""
+        dt, plan = simulator.dt, simulator.plan()
+        ticks = np.asarray(record.tick)
+        shown = np.nonzero(ticks % max(1, round(TRUTH_PERIOD / dt)) == 0)[0]
+        time, motion = ticks * dt, record.motion
+        end, status = len(ticks), None
+        finish = judge.follow(time[shown], motion.x[shown], motion.y[shown])
+        for ends, reached in (
+            (finish is not None, "goal reached"),
+            (np.any(record.rolled_over), "rolled over"),
+            (not np.all(np.isfinite(motion.x)), "lost its state"),
+            (judge.stalled(float(time[-1])), "stalled"),
+        ):
+            if ends:
+                status = reached
+                break
+        if finish is not None:
+            end = int(shown[finish]) + 1
+        elif status == "rolled over":
+            end = int(np.argmax(record.rolled_over)) + 1
+        end = min(end, int(np.searchsorted(time, longest + 1e-9, side="right")))
+        shown = shown[shown < end]
+        truth = (
+            time,
+            motion.x,
+            motion.y,
+            motion.heading,
+            motion.vx,
+            motion.vy,
+            motion.yaw_rate,
+            *motion.wheels,
+            motion.steering,
+            record.voltage,
+        )
+        columns = {n: np.asarray(c)[shown] for n, c in zip(TRUTH, truth, strict=True)}
+        told = np.nonzero(ticks[:end] % plan.telemetry == 0)[0]
+        telemetry = [time[told]]
+        for reading in (*record.readings.sonar, *record.readings[1:]):
+            new = reading.tick[told] > np.maximum(ticks[told] - plan.telemetry, 0)
+            telemetry.append(np.where(new, reading.value[told], np.nan))
+        echoes = []
+        for reading in record.readings.sonar:
+            new = np.nonzero((reading.tick == ticks) & (ticks > 0))[0]
+            new = new[new < end]
+            echoes.append((time[new], np.asarray(reading.value)[new]))
+        fresh = np.nonzero(np.asarray(record.fresh)[:end])[0]
+        commands = (time[fresh], record.command.throttle[fresh], record.command.steering[fresh])
+        view = {
+            "throttle": record.command.throttle[shown],
+            "steering_command": record.command.steering[shown],
+        }
+        for wheel, forces in zip(WHEELS, record.forces, strict=True):
+            for name, values in forces._asdict().items():
+                view[f"{wheel}_{name}"] = np.asarray(values)[shown]
+        return Log(
+            Rows(commands, tuple(telemetry), tuple(columns.values())),
+            columns | {name: np.asarray(getattr(record, name))[shown] for name in COUNTS},
+            view,
+            tuple(echoes),
+        ), status
+
+
+def make_view(
+    simulator: Simulator, about: dict[str, Any], result: dict[str, Any], logs: list[Log]
+) -> dict[str, Any]:
+    """What report and picture are made from: plain lists, units in the names."""
+    truth = {name: np.concatenate([log.truth[name] for log in logs]) for name in logs[0].truth}
+    extra = {name: np.concatenate([log.view[name] for log in logs]) for name in logs[0].view}
+    every = slice(None, None, max(1, round(VIEW_PERIOD / TRUTH_PERIOD)))
+    body, sonar = simulator.car.body, simulator.car.sensors.sonar
+    tires = (simulator.car.tires.front,) * 2 + (simulator.car.tires.rear,) * 2
+    place = about.get("course", {}).get("name", "open floor")
+    shown = {
+        "speed_mps": np.hypot(truth["vx_mps"], truth["vy_mps"]),
+        "sideslip_deg": np.degrees(sideslip(truth["vx_mps"], truth["vy_mps"])),
+        "yaw_rate_degps": np.degrees(truth["yaw_rate_radps"]),
+        "steering_deg": np.degrees(truth["steering_rad"]),
+        "steering_command_deg": np.degrees(extra["steering_command"]),
+        "throttle": extra["throttle"],
+    } | {name: truth[name] for name in ("time_s", "x_m", "y_m", "heading_rad")}
+    wheels = [
+        {
+            "force_x_n": extra[f"{wheel}_force_x"][every].tolist(),
+            "force_y_n": extra[f"{wheel}_force_y"][every].tolist(),
+            "limit_n": extra[f"{wheel}_limit"][every].tolist(),
+            "slip_mps": extra[f"{wheel}_slip"][every].tolist(),
+            "angle_rad": extra[f"{wheel}_angle"][every].tolist(),
+        }
+        for wheel in WHEELS
+    ]
+    mounts = []
+    for i, (name, mount) in enumerate(zip(sonar.mount_names, sonar.mounts, strict=True)):
+        times = np.concatenate([log.echoes[i][0] for log in logs])
+        heard = np.concatenate([log.echoes[i][1] for log in logs])
+        mounts.append(
+            {
+                "name": name,
+                "x_m": float(mount.x),
+                "y_m": float(mount.y),
+                "angle_deg": math.degrees(mount.angle),
+                "half_angle_deg": math.degrees(sonar.half_angle),
+                "time_s": times.tolist(),
+                "distance_m": [d if math.isfinite(d) else None for d in heard.tolist()],
+            }
+        )
+    return {
+        "title": f"{place}, {about['driver']}, {about['car_name']}, seed {simulator.seed}",
+        "summary": result,
+        "walls_m": about.get("course", {}).get("walls_m", []),
+        "car": {
+            "length_m": float(body.length),
+            "width_m": float(body.width),
+            "center_x_m": float(body.center),
+            "wheels": [
+                {
+                    "x_m": float(x),
+                    "y_m": float(y),
+                    "radius_m": float(tire.radius),
+                    "width_m": float(tire.width),
+                }
+                for x, y, tire in zip(*wheel_positions(body), tires, strict=True)
+            ],
+        },
+        "sonar": mounts if place != "open floor" else [],
+        "wheels": wheels,
+    } | {name: values[every].tolist() for name, values in shown.items()}
+
+
+def about_run(simulator: Simulator, driver: str, car: str, laps: int) -> dict[str, Any]:
+    """What `run.toml` says: enough to drive it again."""
+    plan, link = simulator.plan(), simulator.link
+    sensors = plan.sensors._asdict()
+    about: dict[str, Any] = {
+        "driver": driver,
+        "car_name": car,
+        "seed": simulator.seed,
+        "laps": laps,
+        "estimate": simulator.estimate,
+        "battery_charge": simulator.charge,
+        "rates": {
+            "dt_s": simulator.dt,
+            "control_s": plan.control * simulator.dt,
+            "telemetry_s": plan.telemetry * simulator.dt,
+            "truth_s": max(1, round(TRUTH_PERIOD / simulator.dt)) * simulator.dt,
+        }
+        | {f"{name}_s": ticks * simulator.dt for name, ticks in sensors.items()},
+        "link": {
+            "name": link.name,
+            "delay_s": link.delay,
+            "loss": link.loss,
+            "timeout_s": link.timeout,
+        },
+        "precision_bits": 8 * np.asarray(simulator.car.body.mass).dtype.itemsize,
+        "versions": {
+            name: importlib.metadata.version(name) for name in ("countersteer", "jax", "numpy")
+        }
+        | {"python": sys.version.split()[0]},
+        "car": car_tables(simulator.car),
+    }
+    if simulator.course is not None:
+        about["course"] = course_tables(simulator.course)
+    if simulator.start is not None:
+        about["start"] = dict(zip(("x_m", "y_m", "heading_rad"), simulator.start, strict=True))
+    if any(simulator.velocity):
+        names = ("vx_mps", "vy_mps", "yaw_rate_radps")
+        about["initial"] = dict(zip(names, simulator.velocity, strict=True))
+    return about
+
+
+def telemetry_header(simulator: Simulator) -> tuple[str, ...]:
+    """Columns of `telemetry.csv` for the car's sensors."""
+    return (
+        "time_s",
+        *(f"sonar_{name}_m" for name in simulator.car.sensors.sonar.mount_names),
+        "encoder_counts",
+        "wheel_speed_mps",
+        "gyro_radps",
+        "accel_x_mps2",
+        "accel_y_mps2",
+        "battery_v",
+    )
+
+
+def drive(
+    simulator: Simulator,
+    folder: Path,
+    about: dict[str, Any],
+    laps: int,
+    longest: float,
+    report: Callable[[float, float], None] = lambda done, of: None,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Drives to the goal, or for `longest` seconds, and writes the run's folder but its picture.
+
+    Returns the summary and what the pictures show. `report` is told the progress (m or s). On an
+    interrupt the files are ended, and the drive counts as interrupted.
+    """
+    judge = Judge(simulator.course, laps)
+    logs: list[Log] = []
+    status = "out of time"
+    with RunWriter(folder, about, telemetry_header(simulator)) as writer:
+        with contextlib.closing(simulator.run(longest)) as pieces:
+            try:
+                for record in pieces:
+                    log, end = Log.read(record, simulator, judge, longest)
+                    logs.append(log)
+                    writer.write(log.rows)
+                    if judge.goal is not None:
+                        report(judge.distance, judge.goal)
+                    else:
+                        report(float(log.truth["time_s"][-1]), longest)
+                    if end is not None:
+                        status = end
+                        break
+            except KeyboardInterrupt:
+                if not logs:
+                    raise
+                status = "interrupted"
+        contacts = int(logs[-1].truth["wall_contacts"][-1]) if logs else 0
+        if judge.goal is None and status == "out of time":
+            status = "done"
+        truth = {n: np.concatenate([log.truth[n] for log in logs]) for n in (*TRUTH, *COUNTS)}
+        result = summary(simulator.course, laps, status, truth, contacts)
+        writer.finish(result)
+    view = make_view(simulator, about, result, logs)
+    (folder / "report.html").write_text(report_html(view))
+    return result, view

@@ -1,0 +1,144 @@
+"""Turns of a drive, and what became of it."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from countersteer.course.course import Course, progress
+
+STRAIGHT_RATE, STRAIGHT_SLIP = math.radians(30), math.radians(10)
+STRAIGHT_FOR = 0.05  # s below both until a turn has ended
+LONGEST = 2.0  # s after which a turn has ended whatever the car does
+SLOW = 0.2  # m/s under which the direction of motion, and so sideslip, means nothing
+
+
+@dataclasses.dataclass(frozen=True)
+class TurnResult:
+    """One turn; names and units are those of the JSON."""
+
+    begin_s: float
+    end_s: float
+    entry_speed_mps: float
+    peak_sideslip_deg: float
+    peak_yaw_rate_degps: float
+    heading_error_deg: float
+    duration_s: float
+
+
+def sideslip(vx: np.ndarray, vy: np.ndarray) -> np.ndarray:
+    """Angle from the nose to the velocity (rad); 0 where the car all but stands."""
+    return np.where(np.hypot(vx, vy) > SLOW, np.arctan2(vy, vx), 0.0)
+
+
+def find_turns(
+    course: Course,
+    time: np.ndarray,
+    heading: np.ndarray,
+    vx: np.ndarray,
+    vy: np.ndarray,
+    yaw_rate: np.ndarray,
+    turn: np.ndarray,
+    laps: int,
+) -> list[TurnResult]:
+    """The turns that the driver handed over to.
+
+    `turn` counts those begun. A turn ends when the yaw rate is under 30 °/s and the sideslip under
+    10° for 50 ms, or after 2 s; the yaw rate must have been over that before. The heading error is
+    that at the end, less the outgoing corridor's.
+    """
+    slip = sideslip(vx, vy)
+    calm = (np.abs(yaw_rate) < STRAIGHT_RATE) & (np.abs(slip) < STRAIGHT_SLIP)
+    results = []
+    bearing = course.start[2]
+    for number, corner in enumerate(course.turns_ahead(laps), start=1):
+        begun = np.nonzero(turn >= number)[0]
+        bearing += corner.angle
+        if not len(begun):
+            break
+        begin = int(begun[0])
+        late = np.nonzero(time >= time[begin] + LONGEST)[0]
+        last = int(late[0]) if len(late) else len(time) - 1
+        stirred = begin + int(np.argmax(~calm[begin : last + 1]))
+        end, still = last, time[stirred]
+        for i in range(stirred, last + 1):
+            still = still if calm[i] else time[i]
+            if calm[i] and time[i] - still >= STRAIGHT_FOR - 1e-9:
+                end = i
+                break
+        during = slice(begin, end + 1)
+        error = math.remainder(heading[end] - bearing, 2 * math.pi)
+        results.append(
+            TurnResult(
+                begin_s=float(time[begin]),
+                end_s=float(time[end]),
+                entry_speed_mps=float(np.hypot(vx[begin], vy[begin])),
+                peak_sideslip_deg=float(np.degrees(np.abs(slip[during]).max())),
+                peak_yaw_rate_degps=float(np.degrees(np.abs(yaw_rate[during]).max())),
+                heading_error_deg=math.degrees(error),
+                duration_s=float(time[end] - time[begin]),
+            )
+        )
+    return results
+
+
+class Judge:
+    """Follows a drive while it runs: how far it came, and whether it is over."""
+
+    STALLED = 5.0  # s without a step ahead
+
+    def __init__(self, course: Course | None, laps: int) -> None:
+        """For a course; without one nothing ends a drive but its time."""
+        self.course = course
+        self.goal = course.lap_end(laps) if course else None
+        self.distance = course.start_distance if course else 0.0
+        self.furthest, self.since = self.distance, 0.0
+
+    def follow(self, time: np.ndarray, x: np.ndarray, y: np.ndarray) -> int | None:
+        """Index of the sample at which the goal was reached, if it was among these."""
+        if self.course is None or self.goal is None:
+            return None
+        walked = progress(self.course, x, y, self.distance)
+        self.distance = float(walked[-1])
+        for t, d in zip(time, walked, strict=True):
+            if d > self.furthest + 0.05:
+                self.furthest, self.since = d, float(t)
+        there = np.nonzero(walked >= self.goal - 1e-9)[0]
+        return int(there[0]) if len(there) else None
+
+    def stalled(self, time: float) -> bool:
+        """Whether the car has stopped getting ahead."""
+        return self.goal is not None and time - self.since > self.STALLED
+
+
+def summary(
+    course: Course | None, laps: int, status: str, table: dict[str, np.ndarray], contacts: int
+) -> dict[str, Any]:
+    """The JSON of a drive: `table` holds columns of `truth.csv` and `turn`."""
+    time = table["time_s"]
+    turns = (
+        find_turns(
+            course,
+            time,
+            table["heading_rad"],
+            table["vx_mps"],
+            table["vy_mps"],
+            table["yaw_rate_radps"],
+            table["turn"],
+            laps,
+        )
+        if course is not None
+        else []
+    )
+    completed = status == "goal reached"
+    return {
+        "completed": completed,
+        "success": completed and contacts == 0,
+        "status": status,
+        "wall_contacts": contacts,
+        "lap_time_s": float(time[-1]) if completed else None,
+        "turns": [dataclasses.asdict(turn) for turn in turns],
+    }
+
+
