@@ -150,7 +150,9 @@ def run_drive(options: argparse.Namespace) -> int:
     from countersteer.simulator import Simulator
 
     course, car = load_course(options.course), load_car(options.car, options.set)
-    driver = make_driver(options.driver, course, load_car(options.car), options.speed_mps, options.laps)
+    driver = make_driver(
+        options.driver, course, load_car(options.car), options.speed_mps, options.laps
+    )
     name = Path(options.driver).stem if options.driver.endswith(".csv") else options.driver
     simulator = Simulator(
         course,
@@ -215,7 +217,9 @@ def run_replay(options: argparse.Namespace) -> int:
     )
     times = commands["time_s"]
     last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
-    return record(options, simulator, "replay", options.source.stem, float(times[-1]) + last, 1, name)
+    return record(
+        options, simulator, "replay", options.source.stem, float(times[-1]) + last, 1, name
+    )
 
 
 def record(
@@ -263,7 +267,9 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car") -> int:
     if options.json:
         print(json.dumps(result))
         return DONE
-    print(f"{result['windows']} windows of {result['horizon_s']:g} s; error at the end of a window:")
+    print(
+        f"{result['windows']} windows of {result['horizon_s']:g} s; error at the end of a window:"
+    )
     for name, error in result["median_abs_error"].items():
         nothing = result["persistence"]["median_abs_error"][name]
         print(f"  {name:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")

@@ -14,7 +14,7 @@ the link carries the command, the world takes one step, and the sensors look at 
 import dataclasses
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car, Wheels
-from countersteer.car.parameter import Scalar
+from countersteer.car.parameter import Array, Scalar
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver, Heard, Observation
 from countersteer.estimation import dead_reckoning
@@ -55,8 +55,8 @@ class Plan(NamedTuple):
 class Surroundings(NamedTuple):
     """What stays the same during a drive."""
 
-    walls: jax.Array  # (n, 4), padded with NaN
-    corners: jax.Array  # (2n, 3), from `sonar.edges`
+    walls: Array  # (n, 4), padded with NaN
+    corners: Array  # (2n, 3), from `sonar.edges`
     key: jax.Array
     loss: Scalar
 
@@ -124,7 +124,7 @@ class Simulator:
             suite.periods(self.car, self.dt),
         )
 
-    def run(self, longest: float) -> Iterator[Record]:
+    def run(self, longest: float) -> Generator[Record, None, None]:
         """Drives for at most so many seconds. Each record has a leading axis of ticks.
 
         Whoever reads the pieces may stop when the goal is reached.
@@ -150,10 +150,10 @@ class Simulator:
         pose = self.start or (self.course.start if self.course else (0.0, 0.0, 0.0))
         walls = padded(self.course.walls if self.course else np.zeros((0, 4)), dtype)
         key, driver_key = jax.random.split(jax.random.key(self.seed))
-        around = Surroundings(walls, sonar.edges(walls), key, jnp.asarray(self.link.loss, dtype))
+        around = Surroundings(walls, sonar.edges(walls), key, dtype.type(self.link.loss))
         state = planar.initial_state(self.car, self.dt, pose, self.velocity, self.charge)
         sensors = suite.initial_memory(self.car, state.motion)
-        zero = jnp.zeros((), dtype)
+        zero = dtype.type(0)
         still = Command(zero, zero)
         up = down = None
         if not plan.onboard:
@@ -162,10 +162,8 @@ class Simulator:
         estimate = dead_reckoning.initial_memory(pose, dtype)
         memory = self.driver.reset(driver_key)
         if not jax.tree_util.all_leaves([self.driver]):
-            memory = jax.tree.map(_strong, memory)
-        return around, Loop(
-            jnp.asarray(0, jnp.int32), state, sensors, estimate, still, up, down, memory
-        )
+            memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
+        return around, Loop(np.int32(0), state, sensors, estimate, still, up, down, memory)
 
     def _stepped(
         self, plan: Plan, ticks: int, around: Surroundings, loop: Loop
@@ -222,32 +220,31 @@ def observe(plan: Plan, loop: Loop) -> tuple[Loop, Observation]:
     motion = loop.state.motion
     known = memory.estimate
     if plan.truth:
-        known = Estimate(
-            motion.x, motion.y, motion.heading, motion.vx, motion.vy, motion.yaw_rate
-        )
+        known = Estimate(motion.x, motion.y, motion.heading, motion.vx, motion.vy, motion.yaw_rate)
 
     def heard(reading: Reading) -> Heard:
         age = plan.dt * (loop.tick - reading.tick).astype(jnp.result_type(motion.x))
         return Heard(reading.value, jnp.where(reading.tick >= 0, age, jnp.inf))
 
-    told = jax.tree.map(heard, readings, is_leaf=lambda node: isinstance(node, Reading))
+    told: Any = jax.tree.map(heard, readings, is_leaf=lambda node: isinstance(node, Reading))
     time = plan.dt * loop.tick.astype(jnp.result_type(motion.x))
-    return loop._replace(estimate=memory), Observation(time, *told, known)
+    return loop._replace(estimate=memory), Observation(*(time, *told, known))
 
 
 jitted_observe = jax.jit(observe, static_argnums=0)
 
 
-def advance(
-    plan: Plan, car: Car, around: Surroundings, loop: Loop
-) -> tuple[Loop, Record]:
+def advance(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loop, Record]:
     """One tick: command over the link, world, sensors, readings over the link."""
     command, fresh = loop.command, loop.tick % plan.control == 0
     up, down = loop.up, loop.down
     if up is not None and down is not None:
-        lost = jax.random.uniform(
-            jax.random.fold_in(jax.random.fold_in(around.key, loop.tick), 7), (2,)
-        ) < around.loss
+        lost = (
+            jax.random.uniform(
+                jax.random.fold_in(jax.random.fold_in(around.key, loop.tick), 7), (2,)
+            )
+            < around.loss
+        )
         up = exchange(up, command, lost[0], loop.tick, plan.control, plan.delay)
         fresh = up.arrived == loop.tick
         silent = loop.tick - up.arrived > plan.timeout
@@ -293,18 +290,19 @@ def voltage(car: Car, motion: Motion) -> Scalar:
     ).battery_voltage
 
 
-def padded(walls: np.ndarray, dtype: np.dtype) -> jax.Array:
+def padded(walls: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Walls with rows of NaN up to a power of two, so that like courses share a program."""
     rows = max(8, 1 << math.ceil(math.log2(max(len(walls), 1))))
     full = np.full((rows, 4), np.nan, dtype)
     full[: len(walls)] = walls
-    return jnp.asarray(full)
+    return full
 
 
-def _strong(leaf: Any) -> jax.Array:
-    """An array whose type does not depend on what it is added to."""
-    leaf = jnp.asarray(leaf)
-    return jax.lax.convert_element_type(leaf, leaf.dtype)
+def _typed(leaf: Any, dtype: np.dtype) -> Any:
+    """A driver's number with a type of its own: that of the car, or a 32-bit integer."""
+    if isinstance(leaf, bool | int):
+        return np.int32(leaf)
+    return dtype.type(leaf) if isinstance(leaf, float) else leaf
 
 
 def _like(new: Any, old: Any) -> Any:

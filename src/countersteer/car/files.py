@@ -135,8 +135,7 @@ def car_tables(part: Any) -> dict[str, Any]:
             table[field.name] = car_tables(value)
         elif field.name == "mounts":
             table["mounts"] = {
-                name: car_tables(mount)
-                for name, mount in zip(part.mount_names, value, strict=True)
+                name: car_tables(mount) for name, mount in zip(part.mount_names, value, strict=True)
             }
     return table
 
@@ -152,8 +151,6 @@ def car_from_tables(tables: dict[str, Any], where: str) -> Car:
 def save_car(car: Car, path: Path, source: dict[str, str]) -> None:
     """Write a car in full. `source` says where each number is from."""
     path.write_text(tomli_w.dumps({"source": source, **car_tables(car)}))
-
-
 
 
 def parameter_lines(part: Any = None, path: str = "") -> list[str]:

@@ -14,7 +14,10 @@ import jax
 
 from countersteer.errors import InputError
 
-Scalar: TypeAlias = jax.Array | float
+# A number: Python's, NumPy's or one that JAX traces; with axes in front, a batch. These have
+# no type in common that arithmetic keeps, so the checker is told nothing.
+Scalar: TypeAlias = Any
+Array: TypeAlias = Any  # the same with one axis or more
 T = typing.TypeVar("T")
 
 # Unit inside -> (suffix of the name at every edge, what one unit outside is inside).
@@ -70,11 +73,10 @@ def choice(default: str, choices: tuple[str, ...], meaning: str, source: str = "
 @typing.dataclass_transform(frozen_default=True, kw_only_default=True)
 def pytree(cls: type[T]) -> type[T]:
     """Make a class a frozen dataclass and a pytree; fields with `static` are not leaves."""
-    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
-    static = [f.name for f in dataclasses.fields(cls) if f.metadata.get("static")]
-    data = [f.name for f in dataclasses.fields(cls) if f.name not in static]
-    return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static)
-
+    made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    static = [f.name for f in dataclasses.fields(made) if f.metadata.get("static")]
+    data = [f.name for f in dataclasses.fields(made) if f.name not in static]
+    return jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=static)
 
 
 def declarations(part: type) -> dict[str, tuple[str, Declaration]]:
@@ -98,7 +100,7 @@ def read_value(where: str, key: str, declared: Declaration, value: Any) -> Any:
         if value not in declared.choices:
             raise InputError(f"{where}: {key} must be one of {', '.join(declared.choices)}")
         return value
-    suffix, factor = EDGE[declared.unit]
+    factor = EDGE[declared.unit][1]
     low, high = declared.low / factor, declared.high / factor
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: {key} must be a number in [{low:g}, {high:g}], not {value!r}")

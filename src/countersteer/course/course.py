@@ -26,7 +26,9 @@ class Course:
     name: str
     width: float | None  # None where there are only free walls
     closed: bool
-    line: np.ndarray  # (n, 2) corner points of the centre line, the first again at the end if closed
+    line: (
+        np.ndarray
+    )  # (n, 2) corner points of the centre line, the first again at the end if closed
     walls: np.ndarray  # (m, 4) x, y of both ends
     turns: tuple[Turn, ...]
     start: tuple[float, float, float]  # x, y, heading
@@ -89,9 +91,10 @@ def from_segments(
     if len(corners) < 2:
         raise InputError(f"{name}: a course needs a straight")
     if closed:
-        if np.hypot(*(corners[-1] - corners[0])) > 1e-6 or abs(
-            math.remainder(heading + turn, 2 * math.pi)
-        ) > 1e-6:
+        if (
+            np.hypot(*(corners[-1] - corners[0])) > 1e-6
+            or abs(math.remainder(heading + turn, 2 * math.pi)) > 1e-6
+        ):
             raise InputError(f"{name}: closed = true, but the segments do not come back to start")
         angles[0], radii[0] = turn, radius
     points, turns = _rounded(name, np.array(corners), angles, radii, closed)
@@ -223,9 +226,10 @@ def grip_speed(course: Course, car: Car) -> float:
 
     The car's centre swings from the outer side over the inner corner to the outer side, on one arc
     per corner. With the free width w (the corridor's, less the car's width), an arc of radius R
-    about a corner of angle a fits if R (1 - cos(a/2)) <= w; and neighbouring arcs share the straight
-    between them: R (tan(a/2) + tan(b/2)) <= its length where the car drives. Then v² = mu g R, with mu of the
-    axle that lets go first in a steady turn, which carries its own share of the weight: the lesser.
+    about a corner of angle a fits if R (1 - cos(a/2)) <= w; and neighbouring arcs share the
+    straight between them: R (tan(a/2) + tan(b/2)) <= its length where the car drives. Then
+    v² = mu g R. Each axle carries its own share of the weight round a steady turn, so the one
+    with the lesser mu lets go first.
     """
     if course.width is None or not course.turns:
         return math.inf

@@ -1,6 +1,7 @@
 """Courses in TOML files."""
 
 import importlib.resources
+import itertools
 import math
 from typing import Any
 
@@ -89,12 +90,14 @@ def _walls(lines: Any, where: str) -> np.ndarray:
     walls = []
     for i, line in enumerate(lines):
         at = f"{where}: walls_m[{i}]"
-        if not isinstance(line, list) or len(line) < 2 or not all(
-            isinstance(p, list) and len(p) == 2 for p in line
+        if (
+            not isinstance(line, list)
+            or len(line) < 2
+            or not all(isinstance(p, list) and len(p) == 2 for p in line)
         ):
             raise InputError(f"{at} must hold two or more points [x, y]")
         points = [[_number(c, at, -1e5, 1e5) for c in p] for p in line]
-        walls.extend([[*a, *b] for a, b in zip(points, points[1:], strict=False)])
+        walls.extend([[*a, *b] for a, b in itertools.pairwise(points)])
     return np.array(walls)
 
 
@@ -113,7 +116,9 @@ def course_tables(course: Course) -> dict[str, Any]:
         "start_distance_m": course.start_distance,
         "walls_m": course.walls.tolist(),
         "line_m": course.line.tolist(),
-        "turns": [{"distance_m": t.distance, "turn_deg": math.degrees(t.angle)} for t in course.turns],
+        "turns": [
+            {"distance_m": t.distance, "turn_deg": math.degrees(t.angle)} for t in course.turns
+        ],
     }
     if course.width is not None:
         tables["width_m"] = course.width

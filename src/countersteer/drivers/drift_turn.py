@@ -1,6 +1,7 @@
 """Drifts round the corners of a corridor, on sonar, encoder, gyroscope and accelerometer."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from countersteer.drivers.driver import Command, Observation
 from countersteer.drivers.straighten import Straighten
 
 STRAIGHT, SPIN, CATCH = 0, 1, 2
-SPEED = 1.9  # m/s, unless another is asked for
+SPEED = 2.04  # m/s, unless another is asked for
 
 
 class Memory(NamedTuple):
@@ -32,12 +33,13 @@ class Memory(NamedTuple):
 
 @pytree
 class DriftTurn:
-    """Straightens until the wall ahead is near; then wheels over and throttle high; then, when the
-    heading turned plus what it will still turn reaches the target, wheels back and throttle off.
+    """Straightens; turns the wheels over at the wall; turns them back in time to end up straight.
 
-    What it will still turn is `coast` times the yaw rate: the paper's regression, here with a
-    slope set by hand. Targets are headings of corridors, so a turn's error is the next one's to
-    mend. The lock shrinks as the speed squared grows, so that the car is not thrown round.
+    The turn begins when the wall ahead is near: wheels over, throttle high. When the heading turned
+    plus what it will still turn reaches the target: wheels back, throttle off. What it will still
+    turn is `coast` times the yaw rate: the paper's regression, with a slope set by hand. Targets
+    are headings of corridors, so a turn's error is the next one's to mend. The lock shrinks as the
+    speed squared grows, and holds the yaw rate, so that the car is not thrown round.
     """
 
     straight: Straighten
@@ -47,25 +49,21 @@ class DriftTurn:
     width: Scalar
     ping: Scalar  # s between two readings of a sonar
     front: int = dataclasses.field(metadata={"static": True})
-    trigger: Scalar = 1.05  # distance of the centre of mass to the wall ahead at handover, m
-    trigger_speed: Scalar = 0.15  # more of it per speed over 2 m/s, s
-    lock: Scalar = 0.42  # rad
+    trigger: Scalar = 1.25  # distance of the centre of mass to the wall ahead at handover, m
+    trigger_speed: Scalar = 0.55  # more of it per speed over 2 m/s, s
+    lock: Scalar = 0.39  # rad
     lock_speed: Scalar = 2.0  # m/s from which the lock shrinks
-    rate: Scalar = 4.2  # yaw rate that the spin is held at by the lock, rad/s
-    rate_gain: Scalar = 0.1  # s
-    throttle: Scalar = 0.75
-    coast: Scalar = 0.16  # s
-    counter: Scalar = 0.35  # lock while catching, rad
-    settled: Scalar = 0.6  # yaw rate (rad/s) at which the straightening takes over
+    rate: Scalar = 3.5  # yaw rate that the spin is held at by the lock, rad/s
+    rate_gain: Scalar = 0.115  # s
+    throttle: Scalar = 0.25
+    coast: Scalar = 0.089  # s
+    counter: Scalar = 0.33  # lock while catching, rad
+    settled: Scalar = 0.8  # yaw rate (rad/s) at which the straightening takes over
     longest: Scalar = 1.2  # s that a phase of a turn may take
 
     def reset(self, key: jax.Array) -> Memory:
         """Straight ahead."""
-        zero = 0.0 * jnp.asarray(self.straight.speed)
-        none = jnp.asarray(0, jnp.int32)
-        return Memory(
-            none, none, zero, zero, zero + jnp.inf, zero + jnp.inf, self.straight.reset(key)
-        )
+        return Memory(STRAIGHT, 0, 0.0, 0.0, math.inf, math.inf, self.straight.reset(key))
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
@@ -127,8 +125,8 @@ class DriftTurn:
             integral=jnp.where(phase == STRAIGHT, straight.integral, 0.0),
         )
         return command, Memory(
-            phase.astype(jnp.int32),
-            memory.turn + begins.astype(jnp.int32),
+            phase,
+            memory.turn + begins,
             jnp.where(changed, now, memory.since),
             jnp.where(begins, 0.0, walked),
             ahead,

@@ -12,8 +12,6 @@ from countersteer.car.parameter import Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Command, Observation
 
-
-
 SPEED = 1.5  # m/s, unless another is asked for
 
 
@@ -56,8 +54,7 @@ class Straighten:
     def reset(self, key: jax.Array) -> Memory:
         """In the middle of the corridor."""
         del key
-        zero = 0.0 * jnp.asarray(self.speed)
-        return Memory(zero, zero, zero + self.bearing, zero)
+        return Memory(0.0, 0.0, self.bearing, 0.0)
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """Steers to the middle at the speed that was asked for."""
@@ -93,9 +90,7 @@ class Straighten:
         asked = self.hold * speed + self.throttle_p * (speed - seen.estimate.vx)
         # Braking would reverse a car that stands; let it roll instead.
         throttle = jnp.clip(asked, 0.0, 1.0) + self.dead_zone * jnp.where(asked > 0, 1.0, 0.0)
-        return Command(
-            jnp.clip(throttle, 0.0, 1.0), jnp.clip(steering, -self.limit, self.limit)
-        )
+        return Command(jnp.clip(throttle, 0.0, 1.0), jnp.clip(steering, -self.limit, self.limit))
 
 
 def straighten(course: Course, car: Car, speed: float | None = None) -> Straighten:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from countersteer.car.parameter import Scalar
 from countersteer.sensing.suite import Readings
@@ -32,10 +33,10 @@ class Memory(NamedTuple):
     encoder: Scalar
 
 
-def initial_memory(pose: tuple[Scalar, Scalar, Scalar], dtype: jnp.dtype) -> Memory:
+def initial_memory(pose: tuple[float, float, float], dtype: np.dtype) -> Memory:
     """At rest at a known pose."""
-    estimate = Estimate(*(jnp.asarray(value, dtype) for value in (*pose, 0, 0, 0)))
-    none = jnp.asarray(0, jnp.int32)
+    estimate = Estimate(*(dtype.type(value) for value in (*pose, 0, 0, 0)))
+    none = np.int32(0)
     return Memory(estimate, none, none, none)
 
 

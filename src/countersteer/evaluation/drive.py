@@ -227,7 +227,7 @@ def drive(
     about: dict[str, Any],
     laps: int,
     longest: float,
-    report: Callable[[float, float], None] = lambda done, of: None,
+    report: Callable[[float, float], None],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Drives to the goal, or for `longest` seconds, and writes the run's folder but its picture.
 

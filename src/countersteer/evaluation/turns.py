@@ -140,5 +140,3 @@ def summary(
         "lap_time_s": float(time[-1]) if completed else None,
         "turns": [dataclasses.asdict(turn) for turn in turns],
     }
-
-

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from countersteer.car.parameter import Scalar
+from countersteer.car.parameter import Array, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,11 +24,9 @@ class Link:
     timeout: float = math.inf  # a car that hears nothing for so long stops
 
 
-# On-board rates, packets and their loss: paper, II.E; delay, loss and timeout of the radio: assumed.
+# Rates: paper, II.E. Delay, loss and timeout of the radio: assumed.
 ONBOARD = Link("onboard", control_period=0.001, telemetry_period=0.005, onboard=True)
-RADIO = Link(
-    "radio", 0.1, 0.03, onboard=False, delay=0.02, loss=0.05, timeout=0.5
-)
+RADIO = Link("radio", 0.1, 0.03, onboard=False, delay=0.02, loss=0.05, timeout=0.5)
 LINKS = {link.name: link for link in (ONBOARD, RADIO)}
 
 
@@ -35,7 +34,7 @@ class Channel(NamedTuple):
     """One direction of a radio: packets on their way, and the last one that arrived."""
 
     packets: Any  # a pytree whose leaves have a slot a packet in front
-    lost: jax.Array
+    lost: Array
     latest: Any
     arrived: Scalar  # tick of the last arrival; -1 before the first
 
@@ -43,10 +42,8 @@ class Channel(NamedTuple):
 def initial_channel(packet: Any, period: int, delay: int) -> Channel:
     """A channel with nothing on its way; `packet` is what its far end assumes until it hears."""
     slots = delay // period + 2
-    packets = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * slots), packet)
-    return Channel(
-        packets, jnp.ones(slots, bool), packet, jnp.asarray(-1, jnp.int32)
-    )
+    packets = jax.tree.map(lambda leaf: np.stack([leaf] * slots), packet)
+    return Channel(packets, np.ones(slots, bool), packet, np.int32(-1))
 
 
 def exchange(

@@ -1,29 +1,30 @@
 """Sonar: the nearest echo in a wide cone."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from countersteer.car.car import Mount, Sonar
+from countersteer.car.car import Sonar
 from countersteer.car.parameter import Scalar
 
 MERGED = 1e-4  # m within which ends of walls are one corner
 
 
-def edges(walls: jax.Array) -> jax.Array:
+def edges(walls: np.ndarray) -> np.ndarray:
     """(2n, 3): the ends of all walls, and 1 where such an end can scatter sound, else 0.
 
-    An end scatters if it stands free or sticks out: not in the inside of a corner. Which side is
-    in is not known to free walls, so a corner scatters unless its walls meet in line; in an inner
-    corner the walls themselves are nearer in every direction from which they can be seen.
+    An end scatters unless it is a seam, where two walls meet in line. The end in an inside corner
+    scatters too: it changes nothing, as the walls beside it are nearer.
     """
-    ends = jnp.concatenate([walls[:, :2], walls[:, 2:]])
-    others = jnp.concatenate([walls[:, 2:], walls[:, :2]])
-    along = others - ends
-    along = along / jnp.sqrt(jnp.sum(along**2, axis=1, keepdims=True) + 1e-18)
-    same = jnp.sum((ends[:, None] - ends[None]) ** 2, axis=-1) < MERGED**2
-    straight = jnp.sum(along[:, None] * along[None], axis=-1) < -0.999
-    scatters = ~jnp.any(same & straight, axis=1)
-    return jnp.concatenate([ends, scatters[:, None]], axis=1)
+    ends = np.concatenate([walls[:, :2], walls[:, 2:]])
+    along = np.concatenate([walls[:, 2:], walls[:, :2]]) - ends
+    along = along / np.sqrt(np.sum(along**2, axis=1, keepdims=True) + 1e-18)
+    same = np.sum((ends[:, None] - ends[None]) ** 2, axis=-1) < MERGED**2
+    straight = np.sum(along[:, None] * along[None], axis=-1) < -0.999
+    scatters = ~np.any(same & straight, axis=1)
+    return np.concatenate([ends, scatters[:, None]], axis=1).astype(walls.dtype)
 
 
 def distances(
@@ -42,43 +43,52 @@ def distances(
     Whatever a wall hides returns nothing. A mount that pings together with others also hears
     their echoes, at half the way out and back, if they come from within `hearing`.
     """
-    spots = [_mounted(mount, pose) for mount in sonar.mounts]
-    keys = jax.random.split(key, len(spots) + 1)
-    chance = jax.random.uniform(keys[0], (corners.shape[0],))
-    lit = corners.at[:, 2].set(jnp.where(chance < sonar.edge_echo, corners[:, 2], 0.0))
-    echoes = [_echo(sonar, walls, lit, *spot) for spot in spots]
-    heard = []
-    for i, (x, y, bearing) in enumerate(spots):
-        best = echoes[i][0]
-        for j, (distance, echo_x, echo_y) in enumerate(echoes):
-            if j == i:
-                continue
-            dx, dy = echo_x - x, echo_y - y
-            back = jnp.sqrt(dx**2 + dy**2 + 1e-12)
-            within = jnp.cos(bearing) * dx + jnp.sin(bearing) * dy > back * jnp.cos(sonar.hearing)
-            stray = jnp.where(within & (fires[j] > 0), (distance + back) / 2, jnp.inf)
-            best = jnp.minimum(best, stray)
-        noisy = best + sonar.noise * jax.random.normal(keys[i + 1], dtype=jnp.result_type(best))
-        step = jnp.maximum(sonar.resolution, 1e-6)
-        read = jnp.maximum(jnp.round(noisy / step) * step, sonar.nearest)
-        heard.append(jnp.where(best <= sonar.reach, read, jnp.inf))
-    return tuple(heard)
+    x, y, bearing = (jnp.stack(values) for values in zip(*_spots(sonar, pose), strict=True))
+    edge_key, noise_key = jax.random.split(key)
+    chance = jax.random.uniform(edge_key, (corners.shape[0],))
+    lit = jnp.where(chance < sonar.edge_echo, corners[:, 2], 0.0)
+    away, echo_x, echo_y = jax.vmap(partial(_echo, sonar, walls, corners[:, :2], lit))(
+        x, y, bearing
+    )
+    # Rows: who hears; columns: whose ping.
+    dx, dy = echo_x - x[:, None], echo_y - y[:, None]
+    back = jnp.sqrt(dx**2 + dy**2 + 1e-12)
+    ahead = jnp.cos(bearing)[:, None] * dx + jnp.sin(bearing)[:, None] * dy
+    hears = (ahead > back * jnp.cos(sonar.hearing)) & (jnp.stack(fires) > 0)
+    stray = jnp.where(hears, (away + back) / 2, jnp.inf)
+    best = jnp.minimum(away, jnp.min(stray, axis=1))
+    noisy = best + sonar.noise * jax.random.normal(noise_key, best.shape, best.dtype)
+    step = jnp.maximum(sonar.resolution, 1e-6)
+    read = jnp.maximum(jnp.round(noisy / step) * step, sonar.nearest)
+    return tuple(jnp.where(best <= sonar.reach, read, jnp.inf))
 
 
-def _mounted(mount: Mount, pose: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+def _spots(
+    sonar: Sonar, pose: tuple[Scalar, Scalar, Scalar]
+) -> list[tuple[Scalar, Scalar, Scalar]]:
+    """Place and bearing of each mount."""
     x, y, heading = pose
     cosine, sine = jnp.cos(heading), jnp.sin(heading)
-    return (
-        x + cosine * mount.x - sine * mount.y,
-        y + sine * mount.x + cosine * mount.y,
-        heading + mount.angle,
-    )
+    return [
+        (
+            x + cosine * mount.x - sine * mount.y,
+            y + sine * mount.x + cosine * mount.y,
+            heading + mount.angle,
+        )
+        for mount in sonar.mounts
+    ]
 
 
 def _echo(
-    sonar: Sonar, walls: jax.Array, corners: jax.Array, x: Scalar, y: Scalar, bearing: Scalar
+    sonar: Sonar,
+    walls: jax.Array,
+    corners: jax.Array,
+    lit: jax.Array,
+    x: Scalar,
+    y: Scalar,
+    bearing: Scalar,
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Distance and place of the nearest echo of one mount."""
+    """Distance and place of the nearest echo of one mount; `lit` is 1 for corners that echo."""
     start, end = walls[:, :2] - jnp.stack([x, y]), walls[:, 2:] - jnp.stack([x, y])
     length = jnp.sqrt(jnp.sum((end - start) ** 2, axis=1) + 1e-18)
     along = (end - start) / length[:, None]
@@ -102,11 +112,11 @@ def _echo(
     low, high = jnp.maximum(low, 0.0), jnp.minimum(high, length)
     at = jnp.clip(foot, low, high)
     point = start + at[:, None] * along
-    points = jnp.concatenate([point, corners[:, :2] - jnp.stack([x, y])])
+    points = jnp.concatenate([point, corners - jnp.stack([x, y])])
     reach = jnp.sqrt(jnp.sum(points**2, axis=1) + 1e-18)
     ahead = jnp.cos(bearing) * points[:, 0] + jnp.sin(bearing) * points[:, 1]
-    lit = ahead > reach * jnp.cos(sonar.half_angle)
-    seen = jnp.concatenate([low <= high, (corners[:, 2] > 0) & lit[walls.shape[0] :]])
+    within = ahead > reach * jnp.cos(sonar.half_angle)
+    seen = jnp.concatenate([low <= high, (lit > 0) & within[walls.shape[0] :]])
     seen = seen & ~_hidden(start, end, points)
     reach = jnp.where(seen, reach, jnp.inf)
     nearest = jnp.argmin(reach)

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Scalar
@@ -67,9 +68,9 @@ def periods(car: Car, dt: float) -> Periods:
 
 def initial_memory(car: Car, motion: Motion) -> Memory:
     """Sensors that have not reported yet."""
-    zero = jnp.zeros((), jnp.result_type(motion.x))
-    none = Reading(zero, jnp.asarray(-1, jnp.int32))
-    no_echo = none._replace(value=zero + jnp.inf)
+    dtype = np.asarray(motion.x).dtype.type
+    zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
+    no_echo = none._replace(value=dtype(np.inf))
     readings = Readings(tuple(no_echo for _ in car.sensors.sonar.mounts), *[none] * 6)
     return Memory(readings, zero, zero, zero, motion.vx, motion.vy)
 

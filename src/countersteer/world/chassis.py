@@ -95,7 +95,9 @@ def wheel_loads(body: Body, ax: Scalar, ay: Scalar) -> Wheels:
     to_front = jnp.clip(body.front_roll_share * aside, -front / 2, front / 2)
     to_rear = jnp.clip(aside - to_front, -rear / 2, rear / 2)
     to_front = jnp.clip(aside - to_rear, -front / 2, front / 2)
-    return Wheels(front / 2 - to_front, front / 2 + to_front, rear / 2 - to_rear, rear / 2 + to_rear)
+    return Wheels(
+        front / 2 - to_front, front / 2 + to_front, rear / 2 - to_rear, rear / 2 + to_rear
+    )
 
 
 def pair_in_air(loads: Wheels) -> Scalar:

@@ -103,9 +103,7 @@ def shaft(car: Car, front: Axle, rear: Axle, drive: Drive, speed: Scalar, h: Sca
     )
 
 
-def shaft_impulses(
-    s: Shaft, front: Axle, rear: Axle, momenta: Wheels
-) -> tuple[Scalar, Scalar]:
+def shaft_impulses(s: Shaft, front: Axle, rear: Axle, momenta: Wheels) -> tuple[Scalar, Scalar]:
     """Torque impulses on the front and rear axle for the wheels' free angular momenta."""
     free_front = front.share_left * momenta.front_left + front.share_right * momenta.front_right
     free_rear = rear.share_left * momenta.rear_left + rear.share_right * momenta.rear_right

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car, Wheels, wheel_positions
-from countersteer.car.parameter import Scalar
+from countersteer.car.parameter import Array, Scalar
 from countersteer.world import battery, chassis, drivetrain, motor, servo, tyre, walls
 from countersteer.world.chassis import Symmetric, Vector, combine, dot
 from countersteer.world.state import Motion, State
@@ -64,7 +64,7 @@ def initial_state(
     charge: float = 1.0,
     slots: int | None = None,
 ) -> State:
-    """A car at x, y, heading with velocity vx, vy, yaw rate, its wheels rolling, no command under way.
+    """A car at x, y, heading with velocity vx, vy, yaw rate; wheels roll, no command is under way.
 
     `slots` is the length of the delay lines in ticks; by default what the car's delays need.
     """
@@ -72,17 +72,17 @@ def initial_state(
     zero = dtype.type(0)
     if slots is None:
         slots = delay_slots(car, dt)
-    vx, vy, yaw_rate = velocity
+    vx, _, yaw_rate = velocity
     speeds = Wheels(
         *(
-            jnp.asarray((vx - yaw_rate * y) / tire.radius, dtype)
+            (vx - yaw_rate * y) / tire.radius
             for y, tire in zip(wheel_positions(car.body)[1], tires_by_wheel(car), strict=True)
         )
     )
-    motion = Motion(*pose, *velocity, speeds, zero, zero, zero, zero, charge)  # type: ignore[arg-type]
-    motion = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), motion)
-    line = jnp.zeros(slots, dtype)
-    return State(motion, line, line, *[jnp.asarray(zero)] * 4)
+    motion = Motion(*pose, *velocity, speeds, zero, zero, zero, zero, charge)
+    motion = jax.tree.map(dtype.type, motion)
+    line = np.zeros(slots, dtype)
+    return State(motion, line, line, zero, zero, zero, zero)
 
 
 def delay_slots(car: Car, dt: float) -> int:
@@ -94,7 +94,7 @@ def delay_slots(car: Car, dt: float) -> int:
 def tires_by_wheel(car: Car) -> Wheels:
     """The tyre on each wheel."""
     front, rear = car.tires.front, car.tires.rear
-    return Wheels(front, front, rear, rear)  # type: ignore[arg-type]  # a tyre each, not a number
+    return Wheels(front, front, rear, rear)
 
 
 def step(
@@ -122,9 +122,7 @@ def delay(state: State, tick: Tick) -> tuple[State, Tick]:
     return state, tick._replace(asked=Command(throttle, steering))
 
 
-def _delayed(
-    line: jax.Array, now: Scalar, time: Scalar, tick: Tick
-) -> tuple[jax.Array, Scalar]:
+def _delayed(line: Array, now: Scalar, time: Scalar, tick: Tick) -> tuple[Array, Scalar]:
     slots = line.shape[0]
     line = jax.lax.dynamic_update_index_in_dim(
         line, jnp.asarray(now, line.dtype), tick.count % slots, 0
@@ -160,9 +158,7 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
     )
     holds = kinetic_energy(car, after, wheels) <= bound
     safe = implicit(car, held, CHORD, before, start.wheels, h)
-    after, wheels = jax.tree.map(
-        lambda a, b: jnp.where(holds, a, b), (after, wheels), safe
-    )
+    after, wheels = jax.tree.map(lambda a, b: jnp.where(holds, a, b), (after, wheels), safe)
 
     end = loaded(car, follow(car, start, goal, h), start, combine(1.0, after, -1.0, before), h)
     turn = h * (start.yaw_rate + after.yaw) / 2
@@ -261,14 +257,12 @@ def grip(car: Car, motion: Motion) -> Grip:
         tires_by_wheel(car), loads, motion.wheels, rolls, slides, strict=True
     ):
         rim = tire.radius * speed
-        found.append(
-            tyre.contact(tire, load, dot(roll, velocity) - rim, dot(slide, velocity), rim)
-        )
+        found.append(tyre.contact(tire, load, dot(roll, velocity) - rim, dot(slide, velocity), rim))
     driven = drivetrain.driven_speed(car, motion.wheels)
     return Grip(
         rolls,
         slides,
-        Wheels(*found),  # type: ignore[arg-type]  # a contact each
+        Wheels(*found),
         Wheels(*(drivetrain.drag(car, speed) for speed in motion.wheels)),
         motor.drive(car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven),
     )
@@ -326,9 +320,7 @@ def implicit(
         for this, other_own in ((left, axle.own_right), (right, axle.own_left)):
             # h k - pull² (inverse of the axle's matrix), written so that nothing cancels
             resists = bare[this] * (other_own + axle.link) + axle.link * other_own
-            matrix = matrix.plus(
-                h * along[this] * resists / axle.determinant, held.rolls[this]
-            )
+            matrix = matrix.plus(h * along[this] * resists / axle.determinant, held.rolls[this])
         mixed = -pull[left] * pull[right] * axle.link / axle.determinant
         matrix = matrix.plus_mixed(mixed, held.rolls[left], held.rolls[right])
         pulls.append(
@@ -365,7 +357,7 @@ def contact_directions(car: Car, steering: Scalar) -> tuple[Wheels, Wheels]:
     for x, y, (cosine, sine) in zip(xs, ys, (left, right, ahead, ahead), strict=True):
         rolls.append(Vector(cosine, sine, x * sine - y * cosine))
         slides.append(Vector(-sine, cosine, x * cosine + y * sine))
-    return Wheels(*rolls), Wheels(*slides)  # type: ignore[arg-type]  # a vector each
+    return Wheels(*rolls), Wheels(*slides)
 
 
 def kinetic_energy(car: Car, velocity: Vector, wheels: Wheels) -> Scalar:
@@ -385,9 +377,7 @@ def collide(state: State, tick: Tick) -> tuple[State, Tick]:
     fresh = touches * jnp.where(state.touching <= 0, 1.0, 0.0)
     touching = jnp.where(touches > 0, TOUCH_TIME, jnp.maximum(state.touching - tick.dt, 0.0))
     return (
-        state._replace(
-            motion=motion, touching=touching, wall_contacts=state.wall_contacts + fresh
-        ),
+        state._replace(motion=motion, touching=touching, wall_contacts=state.wall_contacts + fresh),
         tick,
     )
 

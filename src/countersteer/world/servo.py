@@ -15,8 +15,10 @@ def target(servo: Servo, asked: Scalar) -> Scalar:
     gained = jnp.where(left, servo.gain_left, servo.gain_right) * asked
     limit = jnp.where(left, servo.limit_left, servo.limit_right)
     hard = jnp.clip(gained, -limit, limit)
-    return (1 - servo.softness) * hard + servo.softness * limit * jnp.tanh(gained / limit) + (
-        servo.trim
+    return (
+        (1 - servo.softness) * hard
+        + servo.softness * limit * jnp.tanh(gained / limit)
+        + (servo.trim)
     )
 
 

@@ -2,10 +2,8 @@
 
 from typing import NamedTuple
 
-import jax
-
 from countersteer.car.car import Wheels
-from countersteer.car.parameter import Scalar
+from countersteer.car.parameter import Array, Scalar
 
 
 class Motion(NamedTuple):
@@ -29,8 +27,8 @@ class State(NamedTuple):
     """A car in its world between two ticks."""
 
     motion: Motion
-    throttle_line: jax.Array  # commands on their way, one slot a tick
-    steering_line: jax.Array
+    throttle_line: Array  # commands on their way, one slot a tick
+    steering_line: Array
     airborne: Scalar  # time that a pair of wheels has carried nothing, s
     touching: Scalar  # time left in which a touch of a wall counts as the same one, s
     wall_contacts: Scalar  # separate touches so far

@@ -21,9 +21,7 @@ class Contact(NamedTuple):
     tangent_y: Scalar
 
 
-def contact(
-    tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar
-) -> Contact:
+def contact(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar) -> Contact:
     """A contact's stiffness, longitudinal and lateral; its force is -k · slip velocity.
 
     The brush model with a parabolic pressure and separate friction for adhering (mu) and sliding

@@ -1,0 +1,308 @@
+"""Files: what is written reads back the same, and what is wrong is refused in one line."""
+
+import json
+import math
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from countersteer import cli
+from countersteer.car.car import Car
+from countersteer.car.files import library, load_car, save_car
+from countersteer.course.course import grip_speed, place, progress
+from countersteer.course.files import library as courses
+from countersteer.course.files import load_course
+from countersteer.errors import InputError
+from countersteer.runs.files import column_rows, command_rows, read_commands, read_table
+from countersteer.runs.run import read_run
+
+COMMANDS = "time_s,throttle,direction,steering_deg\n"
+
+
+@pytest.mark.parametrize("name", library())
+def test_cars_round_trip(name, tmp_path):
+    car = load_car(name)
+    save_car(car, tmp_path / "car.toml", {"all": "a test"})
+    again = load_car(str(tmp_path / "car.toml"))
+    for one, other in zip(jax.tree.leaves(car), jax.tree.leaves(again), strict=True):
+        assert one == pytest.approx(other, rel=1e-14)
+    assert jax.tree.structure(car) == jax.tree.structure(again)
+
+
+def test_a_car_takes_the_rest_from_its_base():
+    rubber, tape = load_car("jetracer"), load_car("jetracer-tape")
+    assert rubber.body == tape.body
+    assert rubber.tires.front.friction > 2 * tape.tires.front.friction
+
+
+def test_overrides_reach_any_declared_parameter():
+    car = load_car("rx7", ["battery.wear=0.5", "sensors.sonar.firing=in-turn"])
+    assert car.battery.wear == 0.5
+    assert car.sensors.sonar.firing == "in-turn"
+    assert load_car("rx7", ["servo.limit_left_deg=20"]).servo.limit_left == math.radians(20)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[body]\nmass_kg = -1.0", "body.mass_kg = -1 is outside its range"),
+        ("[body]\nmass_kg = nan", "body.mass_kg = nan is outside its range"),
+        ("[body]\nmass_kg = '1'", "body.mass_kg must be a number"),
+        ("[body]\nmass = 1.0", "unknown key body.mass; did you mean body.mass_kg?"),
+        ("[wings]\nspan_m = 1.0", "unknown key wings"),
+        ("body = 3", "body must be a table"),
+        ("base = 'no-such-car'", "no car no-such-car"),
+        ("[body\n", "not valid TOML"),
+        ("[body]\nfront_axle_m = 0.3\nwheelbase_m = 0.2", "front_axle_m must be less"),
+        ("[sensors.sonar]\nfiring = 'never'", "must be one of together, in-turn"),
+        ("[tires.front]\nfriction = inf", "tires.front.friction = inf is outside"),
+    ],
+)
+def test_a_wrong_car_is_refused_in_one_line(text, says, tmp_path):
+    path = tmp_path / "car.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_car(str(path))
+    assert says in str(caught.value)
+    assert str(path) in str(caught.value) or "no car" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("width_m = 1.0", "give either segments or walls_m"),
+        ("width_m = 0\nsegments = [{straight_m = 1.0}]", "width_m must be a number in"),
+        ("width_m = 1\nsegments = [{straight_m = nan}]", "segments[0].straight_m must be"),
+        ("width_m = 1\nsegments = [{turn_deg = 90}]", "a course needs a straight"),
+        ("width_m = 1\nsegments = [{bend = 90}]", "segments[0] must be"),
+        ("width_m = 1\nlength_m = 3\nsegments = []", "unknown key length_m"),
+        ("width_m = 1\nclosed = true\nsegments = [{straight_m = 1.0}]", "do not come back"),
+        ("walls_m = [[[0, 0]]]", "walls_m[0] must hold two or more points"),
+        ("width_m = 1\nsegments = [{straight_m = 1}]\n[start]\ndistance_m = 2", "start.distance_m"),
+    ],
+)
+def test_a_wrong_course_is_refused_in_one_line(text, says, tmp_path):
+    path = tmp_path / "course.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_course(str(path))
+    assert says in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("", "holds no command"),
+        ("0,0.5,forward,0\n0.1,1.5,forward,0\n", "line 3: throttle must be in [0, 1]"),
+        ("0,0.5,sideways,0\n", "line 2: direction must be"),
+        ("0,0.5,forward,100\n", "line 2: steering_deg must be in"),
+        ("0.2,0.5,forward,0\n0.1,0.5,forward,0\n", "line 3: time_s goes backwards"),
+        ("0,nan,forward,0\n", "line 2: throttle must be in [0, 1]"),
+        ("nan,0,forward,0\n", "line 2: time_s is not a number"),
+        ("0,zero,forward,0\n", "line 2: throttle must be a number"),
+        ("0,0.5,forward\n0,0.5,forward,0\n", "line 2: 3 cells, not 4"),
+    ],
+)
+def test_wrong_commands_are_refused_in_one_line(rows, says, tmp_path):
+    path = tmp_path / "commands.csv"
+    path.write_text(COMMANDS + rows)
+    with pytest.raises(InputError) as caught:
+        read_commands(path)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["drive"],
+        ["drive", "no-such-course"],
+        ["drive", "box", "--car", "no-such-car"],
+        ["drive", "box", "--car", "missing.toml"],
+        ["drive", "box", "--driver", "nobody"],
+        ["drive", "box", "--driver", "missing.csv"],
+        ["drive", "box", "--set", "battery.wear=2"],
+        ["drive", "box", "--set", "battery.wear=nan"],
+        ["drive", "box", "--set", "wear"],
+        ["drive", "box", "--battery", "1.5"],
+        ["drive", "box", "--battery", "nan"],
+        ["drive", "box", "--speed-mps", "fast"],
+        ["drive", "box", "--dt", "0"],
+        ["drive", "box", "--laps", "0"],
+        ["drive", "box", "--frobnicate"],
+        ["fly", "box"],
+        ["replay", "missing"],
+        ["replay", "missing", "--initial", "vx_mps=2"],
+        ["replay", "missing", "--compare"],
+        ["import", "dart", "missing.csv", "--out", "somewhere"],
+        ["import", "betamax", "missing.csv", "--out", "somewhere"],
+    ],
+)
+def test_wrong_arguments_end_with_status_2_and_one_line(arguments, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert len(printed.err.strip().splitlines()) == 1
+    assert printed.err.startswith("countersteer: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+numbers = st.floats(-1e6, 1e6)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 100), st.floats(-1, 1), st.floats(-1.5, 1.5)), min_size=1))
+def test_commands_round_trip(tmp_path_factory, rows):
+    path = tmp_path_factory.mktemp("commands") / "commands.csv"
+    time, throttle, steering = (np.array(column) for column in zip(*sorted(rows), strict=True))
+    lines = command_rows(time, throttle, steering)
+    path.write_text(COMMANDS + "".join(",".join(line) + "\n" for line in lines))
+    read = read_commands(path)
+    np.testing.assert_array_equal(read["time_s"], time)
+    np.testing.assert_array_equal(read["throttle"], throttle)
+    np.testing.assert_allclose(read["steering"], steering, rtol=1e-15, atol=0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1))
+def test_tables_round_trip(tmp_path_factory, values):
+    path = tmp_path_factory.mktemp("table") / "table.csv"
+    rows = column_rows([np.arange(len(values)), np.array(values)])
+    path.write_text("time_s,value\n" + "".join(",".join(row) + "\n" for row in rows))
+    np.testing.assert_array_equal(read_table(path, ("time_s",))["value"], np.array(values))
+
+
+def test_a_line_that_was_cut_off_is_passed_over(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("time_s,x_m,y_m\n0,1,2\n0.1,1.5")
+    assert len(read_table(path, ("time_s",))) == 1
+
+
+def test_the_box_states_its_grip_speed():
+    course = load_course("box")
+    speed = grip_speed(course, load_car("rx7"))
+    text = (Path(cli.__file__).parent / "course" / "library" / "box.toml").read_text()
+    assert f"{speed:.2f} m/s" in text
+
+
+@pytest.mark.parametrize("name", courses())
+def test_corridors_keep_their_width_and_the_line_its_distance(name):
+    course = load_course(name)
+    for distance in np.linspace(0.01, course.length - 0.01, 97):
+        x, y, heading = place(course, float(distance))
+        a, b = course.walls[:, :2] - [x, y], course.walls[:, 2:] - [x, y]
+        along = (b - a) / np.hypot(*(b - a).T)[:, None]
+        foot = np.clip(-np.sum(a * along, axis=1), 0, np.hypot(*(b - a).T))
+        nearest = np.hypot(*(a + foot[:, None] * along).T).min()
+        assert nearest <= course.width / 2 + 1e-9
+        assert nearest >= course.width / 2 - 1e-9 or abs(heading) >= 0
+        assert progress(course, np.array([x]), np.array([y]), float(distance))[0] == pytest.approx(
+            distance
+        )
+
+
+def test_box_has_four_right_turns_and_closes():
+    course = load_course("box")
+    assert [math.degrees(t.angle) for t in course.turns] == [-90] * 4
+    assert course.length == pytest.approx(12.0)
+    assert len(course.turns_ahead(1)) == 4
+    assert len(course.turns_ahead(3)) == 12
+
+
+def test_every_parameter_is_declared_with_unit_range_and_meaning():
+    from countersteer.car.files import parameter_lines
+
+    lines = parameter_lines(Car())
+    assert len(lines) > 80
+    assert all(len(line.split("]")[1].split("(default")[0].strip()) > 10 for line in lines)
+
+
+def test_a_run_that_is_there_is_moved_aside(tmp_path, capsys):
+    commands = tmp_path / "commands.csv"
+    commands.write_text(COMMANDS + "0,0.3,forward,0\n0.2,0,forward,0\n")
+    out = tmp_path / "run"
+    for _ in range(2):
+        assert cli.main(["replay", str(commands), "--out", str(out), "--json"]) == 0
+    assert read_run(out).truth is not None
+    assert read_run(tmp_path / "run.1").truth is not None
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "precious.txt").write_text("x")
+    assert cli.main(["replay", str(commands), "--out", str(other)]) == 2
+    assert "not a run" in capsys.readouterr().err
+
+
+def start(tmp_path: Path, *arguments: str, **options: object) -> subprocess.Popen:
+    """The command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "countersteer.cli", *arguments],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+def test_an_interrupt_leaves_files_that_read(tmp_path):
+    out = tmp_path / "run"
+    process = start(tmp_path, "drive", "box", "--laps", "500", "--out", str(out), "--json")
+    table = out / "truth.csv"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not (table.exists() and table.stat().st_size > 1000):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    run = read_run(out)
+    assert len(run.truth) > 10
+    assert json.loads((out / "summary.json").read_text())["status"] == "interrupted"
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_reads(tmp_path):
+    """Files may grow to 200 kB: the limit stands in for the disk."""
+    out = tmp_path / "run"
+    process = start(
+        tmp_path,
+        "drive",
+        "box",
+        "--laps",
+        "50",
+        "--out",
+        str(out),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)),
+        env={"PATH": "", "JAX_ENABLE_COMPILATION_CACHE": "false"},
+    )
+    _, errors = process.communicate(timeout=240)
+    assert process.returncode == 1
+    assert len(errors.strip().splitlines()) == 1
+    assert "too large" in errors or "space" in errors
+    assert len(read_run(out).truth) > 10
+
+
+def test_help_comes_without_loading_the_physics():
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import sys, countersteer.cli as c\ntry: c.main(['--help'])\nexcept SystemExit: pass\n"
+            "print(sorted(m for m in sys.modules if m in ('jax', 'numpy', 'matplotlib')))",
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip().endswith("[]")
