@@ -17,7 +17,7 @@ class WallFollower:
         """Sonar: front, left, right, in metres. Steering in rad, positive to the left."""
         front, left, right = (heard.value for heard in observation.sonar)
         memory += 0.02 * (min(left, 2.0) - min(right, 2.0) - memory)
-        steering = 0.6 * memory - 0.2 * observation.gyroscope.value
+        steering = 0.4 * memory - observation.estimate.heading  # the corridor's is 0
         throttle = 0.35 if front > 1.5 and observation.wheel_speed.value < 1.5 else 0.0
         return Command(throttle, max(-0.4, min(0.4, steering))), memory
 

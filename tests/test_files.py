@@ -83,7 +83,7 @@ def test_a_wrong_car_is_refused_in_one_line(text, says, tmp_path):
         ("width_m = 1.0", "give either segments or walls_m"),
         ("width_m = 0\nsegments = [{straight_m = 1.0}]", "width_m must be a number in"),
         ("width_m = 1\nsegments = [{straight_m = nan}]", "segments[0].straight_m must be"),
-        ("width_m = 1\nsegments = [{turn_deg = 90}]", "a course needs a straight"),
+        ("width_m = 1\nsegments = [{turn_deg = 90}]", "a turn must stand between two straights"),
         ("width_m = 1\nsegments = [{bend = 90}]", "segments[0] must be"),
         ("width_m = 1\nlength_m = 3\nsegments = []", "unknown key length_m"),
         ("width_m = 1\nclosed = true\nsegments = [{straight_m = 1.0}]", "do not come back"),

@@ -1,9 +1,11 @@
 """The command line: parse, call, print."""
 
 import argparse
+import importlib
 import json
 import math
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -236,12 +238,16 @@ def record(
     from countersteer.runs.writer import new_folder
     from countersteer.simulator import keep_programs
     from countersteer.viewing.picture import draw_picture
+    from countersteer.viewing.report import report_html
 
     keep_programs()
+    # Matplotlib is imported while the program is compiled or loaded.
+    threading.Thread(target=importlib.import_module, args=("matplotlib.figure",)).start()
     about = about_run(simulator, driver, car_name or options.car, laps)
     folder = new_folder(options.out, f"{Path(place).stem}-{driver}")
     with Progress(options.json) as progress:
         result, view = drive(simulator, folder, about, laps, longest, progress.show)
+    (folder / "report.html").write_text(report_html(view))
     draw_picture(view, folder / "report.png")
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))

@@ -135,14 +135,18 @@ class Simulator:
         with jax.enable_x64(wide):
             around, loop = self.begin(plan)
             scanned = not jax.tree_util.all_leaves([self.driver])
+        before = None
         for _ in range(math.ceil(longest / (ticks * self.dt))):
             with jax.enable_x64(wide):
                 if scanned:
                     loop, record = scan(plan, ticks, self.car, around, self.driver, loop)
                 else:
                     loop, record = self._stepped(plan, ticks, around, loop)
-                record = jax.tree.map(np.asarray, record)
-            yield record
+            # This piece is computed while the one before it is read.
+            if before is not None:
+                yield jax.tree.map(np.asarray, before)
+            before = record
+        yield jax.tree.map(np.asarray, before)
 
     def begin(self, plan: Plan) -> tuple[Surroundings, Loop]:
         """The loop before its first tick."""

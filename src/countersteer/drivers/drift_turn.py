@@ -16,7 +16,7 @@ from countersteer.drivers.driver import Command, Observation
 from countersteer.drivers.straighten import Straighten
 
 STRAIGHT, SPIN, CATCH = 0, 1, 2
-SPEED = 2.04  # m/s, unless another is asked for
+SPEED = 2.02  # m/s, unless another is asked for
 
 
 class Memory(NamedTuple):
@@ -49,16 +49,16 @@ class DriftTurn:
     width: Scalar
     ping: Scalar  # s between two readings of a sonar
     front: int = dataclasses.field(metadata={"static": True})
-    trigger: Scalar = 1.25  # distance of the centre of mass to the wall ahead at handover, m
-    trigger_speed: Scalar = 0.55  # more of it per speed over 2 m/s, s
-    lock: Scalar = 0.39  # rad
+    trigger: Scalar = 1.46  # distance of the centre of mass to the wall ahead at handover, m
+    trigger_speed: Scalar = 0.455  # more of it per speed over 2 m/s, s
+    lock: Scalar = 0.37  # rad
     lock_speed: Scalar = 2.0  # m/s from which the lock shrinks
-    rate: Scalar = 3.5  # yaw rate that the spin is held at by the lock, rad/s
-    rate_gain: Scalar = 0.115  # s
-    throttle: Scalar = 0.25
-    coast: Scalar = 0.089  # s
-    counter: Scalar = 0.33  # lock while catching, rad
-    settled: Scalar = 0.8  # yaw rate (rad/s) at which the straightening takes over
+    rate: Scalar = 3.37  # yaw rate that the spin is held at by the lock, rad/s
+    rate_gain: Scalar = 0.24  # s
+    throttle: Scalar = 0.63
+    coast: Scalar = 0.12  # s
+    counter: Scalar = 0.468  # lock while catching, rad
+    settled: Scalar = 1.2  # yaw rate (rad/s) at which the straightening takes over
     longest: Scalar = 1.2  # s that a phase of a turn may take
 
     def reset(self, key: jax.Array) -> Memory:

@@ -14,6 +14,7 @@ nothing changes (`persistence`), and all of it for those windows in which someth
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -31,7 +32,8 @@ from countersteer.world.planar import Command
 from countersteer.world.state import Motion, State
 
 if TYPE_CHECKING:
-    pass
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 QUANTITIES = ("vx_mps", "vy_mps", "yaw_rate_radps", "wheel_speed_mps")
 HORIZON = 1.0  # s, unless told
@@ -54,7 +56,7 @@ GYRO_LAG = 0.05  # s
 
 SAMPLE = 0.01  # s between the instants at which states are compared
 PIECE = 250  # ticks in a call of the compiled program, whatever the horizon
-MOST_WINDOWS = 256  # simulated at once
+SIZES = (1, 32, 256)  # windows simulated at once: few, for each is a program of its own
 EARLY = 1e-6  # s by which a command may come early, for times that were rounded
 
 
@@ -75,7 +77,7 @@ class Measured(NamedTuple):
     vx: Signal | None  # with vy and yaw_rate; of the centre of mass in the body's axes
     vy: Signal | None
     yaw_rate: Signal | None
-    wheels: tuple[Signal, ...] | None  # spin of the four, known for simulated cars alone
+    wheels: tuple[Signal, ...] | None  # rim speed of the four, known for simulated cars alone
     encoder: Signal | None  # as reported
     gyro: Signal | None
     armed: Signal | None  # dead-man switch, held between its reports; None: always closed
@@ -94,9 +96,16 @@ class Reference(NamedTuple):
     over: float = 0.0
     quantum: float = 0.0
 
-    def undone(self) -> Signal:
-        """The quantity itself, as far as the sensor tells."""
-        return self.signal._replace(time=self.signal.time - self.lag)
+    def undone(self, time: np.ndarray, resting: np.ndarray | bool = False) -> np.ndarray:
+        """Take the lag off: the quantity itself at these times, as far as the sensor tells.
+
+        Where the car rests until then, the last reading tells more than a line to the next one,
+        which shows what followed. Before the first reading it is that reading; NaN after the last.
+        """
+        times, values = self.signal
+        last = values[np.maximum(np.searchsorted(times, time + EARLY, side="right") - 1, 0)]
+        late = np.interp(time + self.lag, times, values, right=math.nan)
+        return np.where(resting, last, late)
 
 
 class Compared(NamedTuple):
@@ -134,28 +143,30 @@ def compare(
     if horizon is None:
         first, last = float(commands["time_s"][0]), float(commands["time_s"][-1])
         starts = np.array([math.ceil(first / dt - EARLY)])
+        resting = _speed(measured, starts * dt, True) < SLOWEST
         ticks = math.floor(last / dt + EARLY) - int(starts[0])
         if ticks < 1:
             raise InputError(f"{run.path}: holds no time between its first command and its last")
     else:
         ticks = max(1, round(horizon / dt))
-        starts = window_starts(measured, commands, ticks, dt)
+        starts, resting = window_starts(measured, commands, ticks, dt)
     if len(starts) == 0:
         raise InputError(
             f"{run.path}: no window of {ticks * dt:g} s in which the dead-man switch is closed and "
             f"the car starts at {SLOWEST:g} m/s or more, or from rest with a throttle onset"
         )
     with jax.enable_x64(True):
-        states = states_at(run, car, measured, starts, ticks, dt)
+        states = states_at(run, car, measured, starts, resting, dt)
         known = np.isfinite(states.motion.vx + states.motion.vy + states.motion.yaw_rate)
-        starts, states = starts[known], jax.tree.map(lambda leaf: leaf[known], states)
+        starts, resting = starts[known], resting[known]
+        states = jax.tree.map(lambda leaf: leaf[known], states)
         predicted = simulate(car, states, commands, starts, ticks, dt) if len(starts) else {}
     whole = horizon is None
     windows: list[Window] = []
     kept = []
     for i, start in enumerate(starts.tolist()):
         series = {name: values[i] for name, values in predicted.items()}
-        window = compared(references, series, start * dt, dt, whole)
+        window = compared(references, series, start * dt, dt, bool(resting[i]), whole)
         if window is not None:
             windows.append(window)
             kept.append(start * dt)
@@ -202,10 +213,9 @@ def read_measured(run: Run, car: Car) -> Measured:
             vx, vy, yaw_rate = velocities(time, truth["x_m"], truth["y_m"], truth["heading_rad"])
         names = [f"wheel_{place}_radps" for place in ("fl", "fr", "rl", "rr")]
         if set(names) <= truth.keys():
-            radii = (float(tire.radius) for tire in planar.tires_by_wheel(car))  # type: ignore[attr-defined]
             wheels = tuple(
                 Signal(time, radius * truth[name])
-                for radius, name in zip(radii, names, strict=True)
+                for radius, name in zip(radii(car), names, strict=True)
             )
     telemetry = run.telemetry if run.telemetry is not None else Table()
     return Measured(
@@ -220,11 +230,17 @@ def read_measured(run: Run, car: Car) -> Measured:
 
 
 def _reported(table: Table, name: str) -> Signal | None:
-    """A sensor's readings, without the rows in which it had nothing new."""
+    """Take a sensor's readings, without the rows in which it had nothing new."""
     if name not in table or not np.any(np.isfinite(table[name])):
         return None
     there = np.isfinite(table[name])
     return Signal(table["time_s"][there], table[name][there])
+
+
+def radii(car: Car) -> list[Any]:
+    """Give the radius of each wheel (m)."""
+    front, rear = car.tires.front.radius, car.tires.rear.radius
+    return [front, front, rear, rear]
 
 
 def velocities(
@@ -266,7 +282,7 @@ def _pieces(known: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def find_references(measured: Measured) -> dict[str, Reference]:
-    """What the log holds of each quantity."""
+    """Find what the log holds of each quantity."""
     found: dict[str, Reference] = {}
     if measured.vx is not None and measured.vy is not None and measured.yaw_rate is not None:
         found["vx_mps"] = Reference(measured.vx, sensor=False)
@@ -284,30 +300,31 @@ def find_references(measured: Measured) -> dict[str, Reference]:
     return found
 
 
-def window_starts(measured: Measured, commands: Table, ticks: int, dt: float) -> np.ndarray:
-    """Ticks at which windows of so many ticks may start."""
+def window_starts(
+    measured: Measured, commands: Table, ticks: int, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ticks at which windows of so many ticks may start, and whether the car rests until then."""
     times = commands["time_s"]
     first, last = float(times[0]), float(times[-1])
     regular = np.arange(math.ceil(first / EVERY) * EVERY, last + EARLY, EVERY)
+    regular = regular[_speed(measured, regular, False) >= SLOWEST]
     throttle = commands["throttle"]
     onsets = times[(np.concatenate([[0.0], throttle[:-1]]) == 0) & (throttle > 0)]
-    starts = np.concatenate(
-        [
-            np.rint(regular[_speed(measured, regular) >= SLOWEST] / dt),
-            np.ceil(onsets[_speed(measured, onsets) < SLOWEST] / dt - EARLY),
-        ]
-    )
-    starts = np.unique(starts.astype(int))
+    onsets = onsets[_speed(measured, onsets, True) < SLOWEST]
+    moving = np.rint(regular / dt).astype(int)
+    resting = np.ceil(onsets / dt - EARLY).astype(int)
+    starts = np.union1d(moving, resting)
     starts = starts[(starts + ticks) * dt <= last + EARLY]
-    return starts[_closed(measured.armed, starts * dt, (starts + ticks) * dt)]
+    starts = starts[_closed(measured.armed, starts * dt, (starts + ticks) * dt)]
+    return starts, np.isin(starts, resting)
 
 
-def _speed(measured: Measured, time: np.ndarray) -> np.ndarray:
-    """The car's speed, as motion capture or else the encoder tells (m/s)."""
+def _speed(measured: Measured, time: np.ndarray, resting: bool) -> np.ndarray:
+    """Give the car's speed, as motion capture or else the encoder tells (m/s)."""
     if measured.vx is not None and measured.vy is not None:
         return np.hypot(measured.vx.at(time), measured.vy.at(time))
     reference = find_references(measured).get("wheel_speed_mps")
-    return reference.undone().at(time) if reference else np.full(len(time), math.nan)
+    return reference.undone(time, resting) if reference else np.full(len(time), math.nan)
 
 
 def _closed(armed: Signal | None, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -326,80 +343,80 @@ def _closed(armed: Signal | None, begin: np.ndarray, end: np.ndarray) -> np.ndar
 
 
 def states_at(
-    run: Run, car: Car, measured: Measured, starts: np.ndarray, ticks: int, dt: float
+    run: Run, car: Car, measured: Measured, starts: np.ndarray, resting: np.ndarray, dt: float
 ) -> State:
-    """The car at the starts of windows, as far as it was measured; leaves have an axis of windows.
+    """Set up the car at the starts of windows; the leaves have an axis of windows.
 
-    NaN where the velocity is not known. Wheels: the encoder's speed is the mean of the four, and
-    they differ as their hubs' speeds do; without it they roll.
+    NaN where the velocity was not measured. Wheels: the encoder's speed is the mean of the four,
+    and they differ as their hubs' speeds do; without an encoder they roll.
     """
     time = starts * dt
     throttle, steering = asked(run.commands, np.arange(int(starts.max()) + 1), dt)
     angle, duty = (trace[starts] for trace in actuators(car, throttle, steering, dt))
-    references = find_references(measured)
-    wheel_speed = references.get("wheel_speed_mps")
-    mean = wheel_speed.undone().at(time) if wheel_speed else np.full(len(time), math.nan)
-    if measured.vx is not None and measured.vy is not None and measured.yaw_rate is not None:
-        vx, vy, yaw_rate = (
-            signal.at(time) for signal in (measured.vx, measured.vy, measured.yaw_rate)
-        )
-        ax, ay = (
-            Signal(signal.time, np.gradient(signal.value, signal.time)).at(time)
-            if len(signal.time) > 1
-            else np.zeros(len(time))
-            for signal in (measured.vx, measured.vy)
-        )
-        ax, ay = np.nan_to_num(ax - yaw_rate * vy), np.nan_to_num(ay + yaw_rate * vx)
-    else:
-        gyro = references.get("yaw_rate_radps")
-        yaw_rate = gyro.undone().at(time) if gyro else np.zeros(len(time))
-        # Before the first reading is before the car has moved.
-        vx, yaw_rate = _held_back(wheel_speed, mean, time), _held_back(gyro, yaw_rate, time)
-        vy, ax, ay = np.zeros(len(time)), np.zeros(len(time)), yaw_rate * vx
-    wheels = _wheels(car, measured, Vector(vx, vy, yaw_rate), angle, mean, time)
     zero = np.zeros(len(time))
-    charge = np.full(len(time), float(run.about.get("battery_charge", 1.0)))
+    vx, vy, yaw_rate, ax, ay = body_at(measured, time, resting)
+    wheels = wheels_at(car, measured, Vector(vx, vy, yaw_rate), angle, time, resting)
+    charge = zero + float(run.about.get("battery_charge", 1.0))
     motion = Motion(zero, zero, zero, vx, vy, yaw_rate, wheels, angle, duty, ax, ay, charge)
     slots = planar.delay_slots(car, dt)
     # A window's count starts at 0, so its slot s holds the command of the tick s - slots.
     before = starts[:, None] + np.arange(-slots, 0)
-    lines = [
+    throttle_line, steering_line = (
         np.where(before >= 0, line[np.maximum(before, 0)], 0.0) for line in (throttle, steering)
-    ]
-    del ticks
-    return State(motion, lines[0], lines[1], zero, zero, zero, zero)
+    )
+    return State(motion, throttle_line, steering_line, zero, zero, zero, zero)
 
 
-def _held_back(reference: Reference | None, value: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """The value, and before the sensor's first reading that reading."""
-    if reference is None:
-        return value
-    signal = reference.undone()
-    return np.where(time < signal.time[0], signal.value[0], value)
+def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Velocity, yaw rate and the centre of mass's acceleration, in the body's axes, at these times.
+
+    Without motion capture the car goes as fast as the encoder says and has no lateral velocity.
+    """
+    if measured.vx is not None and measured.vy is not None and measured.yaw_rate is not None:
+        vx, vy, yaw_rate = (
+            signal.at(time) for signal in (measured.vx, measured.vy, measured.yaw_rate)
+        )
+        change_x, change_y = (_slope(signal).at(time) for signal in (measured.vx, measured.vy))
+        ax, ay = change_x - yaw_rate * vy, change_y + yaw_rate * vx
+        return vx, vy, yaw_rate, np.nan_to_num(ax), np.nan_to_num(ay)
+    references = find_references(measured)
+    vx, yaw_rate = (
+        references[name].undone(time, resting) if name in references else np.zeros(len(time))
+        for name in ("wheel_speed_mps", "yaw_rate_radps")
+    )
+    return vx, 0.0 * vx, yaw_rate, 0.0 * vx, yaw_rate * vx
 
 
-def _wheels(
+def _slope(signal: Signal) -> Signal:
+    """Differentiate; a signal of one sample changes nowhere."""
+    if len(signal.time) < 2:
+        return signal._replace(value=0.0 * signal.value)
+    return signal._replace(value=np.gradient(signal.value, signal.time))
+
+
+def wheels_at(
     car: Car,
     measured: Measured,
     velocity: Vector,
     steering: np.ndarray,
-    mean: np.ndarray,
     time: np.ndarray,
+    resting: np.ndarray,
 ) -> Wheels:
-    """Spin of the four wheels (rad/s)."""
-    tires = planar.tires_by_wheel(car)
+    """Spin of the four wheels at these times (rad/s)."""
     if measured.wheels is not None:
         rims = [wheel.at(time) for wheel in measured.wheels]
     else:
-        rolls, _ = planar.contact_directions(car, jnp.asarray(steering))
-        hubs = [np.asarray(dot(roll, velocity)) for roll in rolls]  # type: ignore[arg-type]
-        missing = np.nan_to_num(mean - np.mean(hubs, axis=0))
-        rims = [hub + missing for hub in hubs]
-    return Wheels(*(rim / tire.radius for rim, tire in zip(rims, tires, strict=True)))  # type: ignore[attr-defined]
+        reference = find_references(measured).get("wheel_speed_mps")
+        rolls, _ = planar.contact_directions(car, steering)
+        rims = [np.asarray(dot(roll, velocity)) for roll in rolls]
+        if reference is not None:
+            slip = reference.undone(time, resting) - np.mean(rims, axis=0)
+            rims = [rim + np.nan_to_num(slip) for rim in rims]
+    return Wheels(*(rim / radius for rim, radius in zip(rims, radii(car), strict=True)))
 
 
 def asked(commands: Table, ticks: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Throttle and steering (rad) that are asked for in these ticks; held, and 0 before the first."""
+    """Look up throttle and steering (rad) asked for in these ticks: held; 0 before the first."""
     last = np.searchsorted(commands["time_s"], ticks * dt + EARLY, side="right") - 1
     held = np.maximum(last, 0)
     return (
@@ -417,23 +434,20 @@ def actuators(
     """
     length = 1 << max(12, math.ceil(math.log2(len(throttle))))  # so that logs share a program
     padded = [np.pad(line, (0, length - len(line)), mode="edge") for line in (throttle, steering)]
-    slots = planar.delay_slots(car, dt)
-    angle, duty = _actuators(car, np.zeros(slots), *padded, dt)
+    angle, duty = _actuators(car, planar.initial_state(car, dt), *padded, dt)
     return np.asarray(angle)[: len(throttle)], np.asarray(duty)[: len(throttle)]
 
 
 @partial(jax.jit, static_argnames="dt")
 def _actuators(
-    car: Car, line: jax.Array, throttle: jax.Array, steering: jax.Array, dt: float
+    car: Car, start: State, throttle: jax.Array, steering: jax.Array, dt: float
 ) -> tuple[jax.Array, jax.Array]:
-    zero = jnp.zeros(())
-    motion = Motion(*[zero] * 6, Wheels(*[zero] * 4), *[zero] * 5)
-    start = State(motion, line, line, *[zero] * 4)
+    no_walls = jnp.full((1, 4), jnp.nan)
 
     def tick(state: State, now: tuple[jax.Array, Command]) -> tuple[State, Any]:
         count, command = now
         begin = (state.motion.steering, state.motion.duty)
-        work = planar.Tick(car, zero, command, command, count, dt)
+        work = planar.Tick(car, no_walls, command, command, count, dt)
         state, work = planar.delay(state, work)
         goal = Command(
             motor.duty(car.motor, work.asked.throttle),
@@ -451,12 +465,12 @@ def simulate(
 ) -> dict[str, np.ndarray]:
     """Each quantity over (windows, ticks + 1), from the start on.
 
-    Windows are padded to a power of two, and ticks to whole pieces, so that programs are shared.
+    Windows are padded to one of `SIZES`, and ticks to whole pieces, so that programs are shared.
     """
     chunks = []
-    for begin in range(0, len(starts), MOST_WINDOWS):
-        chosen = starts[begin : begin + MOST_WINDOWS]
-        size = 1 << math.ceil(math.log2(len(chosen)))
+    for begin in range(0, len(starts), SIZES[-1]):
+        chosen = starts[begin : begin + SIZES[-1]]
+        size = next(size for size in SIZES if size >= len(chosen))
         rows = np.minimum(np.arange(begin, begin + size), begin + len(chosen) - 1)
         state = jax.tree.map(lambda leaf, rows=rows: jnp.asarray(leaf[rows]), states)
         pieces = [np.stack([np.asarray(q) for q in _seen(car, state.motion)])[:, :, None]]
@@ -487,11 +501,8 @@ def _advance(
 
 
 def _seen(car: Car, motion: Motion) -> tuple[Any, ...]:
-    """The four quantities: an encoder between the differentials sees the mean of the wheels."""
-    rims = [
-        tire.radius * wheel  # type: ignore[attr-defined]
-        for tire, wheel in zip(planar.tires_by_wheel(car), motion.wheels, strict=True)
-    ]
+    """Pick the four quantities; an encoder between the differentials sees the wheels' mean."""
+    rims = [radius * spin for radius, spin in zip(radii(car), motion.wheels, strict=True)]
     return motion.vx, motion.vy, motion.yaw_rate, sum(rims) / 4
 
 
@@ -505,9 +516,10 @@ def compared(
     predicted: Mapping[str, np.ndarray],
     start: float,
     dt: float,
+    resting: bool,
     whole: bool,
 ) -> Window | None:
-    """A window from its simulated quantities, a value a tick; None where a reference is missing.
+    """Make a window of simulated quantities, a value a tick; None where a reference is missing.
 
     A sensor may have no reading in a short window, as long as there is a state to compare with.
     With `whole`, what is missing is left out and the rest compared.
@@ -530,9 +542,10 @@ def compared(
             at, truth = at[known], truth[known]
             values = predicted[name]
             still = np.full(len(values), values[0])
-            window[name] = Compared(
-                at, truth, sensed(reference, time, values, at), sensed(reference, time, still, at)
+            simulated, unchanged = (
+                sensed(reference, time, series, at, resting) for series in (values, still)
             )
+            window[name] = Compared(at, truth, simulated, unchanged)
     states = [name for name, reference in references.items() if not reference.sensor]
     if not window or any(name not in window for name in states):
         return None
@@ -540,16 +553,16 @@ def compared(
 
 
 def sensed(
-    reference: Reference, time: np.ndarray, values: np.ndarray, at: np.ndarray
+    reference: Reference, time: np.ndarray, values: np.ndarray, at: np.ndarray, resting: bool
 ) -> np.ndarray:
-    """What the reference's sensor would have reported at these times of a window's quantity.
+    """Give what the reference's sensor would have reported at these times of a window.
 
     Readings early in a window reach back before its start: there, the measured quantity is taken.
     """
     if not reference.sensor:
         return np.interp(at, time, values)
     before = time[0] + np.arange(-(reference.lag + reference.over), -1e-9, SAMPLE)
-    past = reference.undone().at(before)
+    past = reference.undone(before, resting)
     past = np.where(np.isfinite(past), past, values[0])
     time, values = np.concatenate([before, time]), np.concatenate([past, values])
     middle = at - reference.lag
@@ -592,3 +605,175 @@ def scores(windows: Iterable[Window]) -> dict[str, Any]:
             scored["median_abs_error"][name] = float(np.median(ends))
             scored["rmse"][name] = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     return {**result, "persistence": still}
+
+
+# -------------------------------------------------------------------------------------------------
+# The picture
+# -------------------------------------------------------------------------------------------------
+
+_SIZE_IN, _DPI = (14.0, 9.0), 100
+_PAPER, _INK, _SOFT, _LINE, _RELEASED = "#fffefb", "#1b2229", "#5a6570", "#e2ded3", "#f1efe8"
+_MEASURED, _SIMULATED, _STEERED = "#8796a3", "#c4400f", "#0069a8"
+_NAMES = {
+    "vx_mps": ("Forward velocity", "m/s"),
+    "vy_mps": ("Lateral velocity, left positive", "m/s"),
+    "yaw_rate_radps": ("Yaw rate, left positive", "rad/s"),
+    "wheel_speed_mps": ("Wheel speed", "m/s"),
+}
+_SHOWN_EVERY = 1.0  # s between the windows that are drawn
+_LEFT, _RIGHT, _TOP, _BOTTOM, _CAPTION = 0.055, 0.955, 0.895, 0.065, 0.033  # parts of the figure
+
+
+def draw_comparison(series: Mapping[str, Any], path: Path) -> None:
+    """Write to `path`, as PNG, what `compare` gave as its series: measured against simulated.
+
+    Windows are drawn every second at the most, each from its start, marked by a dot. An existing
+    file is replaced.
+    """
+    # Matplotlib takes longer to import than the drawing: who draws nothing does not wait for it.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor=_PAPER)
+    canvas = FigureCanvasAgg(figure)
+    result = series["result"]
+    shown = _apart(series["starts_s"], max(_SHOWN_EVERY, result["horizon_s"]))
+    _write_headline(figure, series["title"], result, len(shown))
+    names = [name for name in QUANTITIES if name in series["measured"]]
+    pitch = (_TOP - _BOTTOM) / (len(names) + 1)
+    for k, name in enumerate([*names, "commands"]):
+        bottom = _TOP - (k + 1) * pitch
+        axes = figure.add_axes((_LEFT, bottom, _RIGHT - _LEFT, pitch - _CAPTION - 0.008))
+        _dress(axes, series, is_last=name == "commands")
+        if name == "commands":
+            _draw_commands(axes, series["commands"])
+            _write_caption(figure, bottom + pitch, "Commands", "")
+            continue
+        _draw_quantity(axes, series, name, shown)
+        title, unit = _NAMES[name]
+        _write_caption(figure, bottom + pitch, f"{title}, {unit}", _said(result, name, unit))
+    canvas.print_png(str(path))
+
+
+def _apart(starts: list[float], least: float) -> list[int]:
+    """Choose windows so that each starts at least so long after the one before."""
+    chosen: list[int] = []
+    for i, start in enumerate(starts):
+        if not chosen or start >= starts[chosen[-1]] + least - EARLY:
+            chosen.append(i)
+    return chosen
+
+
+def _said(result: Mapping[str, Any], name: str, unit: str) -> str:
+    """Say both errors of a quantity, beside those of doing nothing."""
+    if name not in result["rmse"]:
+        return ""
+    still, errors = result["persistence"], []
+    for words, key in (("median at the end", "median_abs_error"), ("RMS", "rmse")):
+        errors.append(f"{words} {result[key][name]:.2f}  ({still[key][name]:.2f})")
+    return f"error, {unit}:   " + "     ".join(errors)
+
+
+def _write_headline(figure: "Figure", title: str, result: Mapping[str, Any], shown: int) -> None:
+    """Write across the top what is compared, and the key."""
+    from matplotlib.lines import Line2D
+
+    figure.text(_LEFT, 0.962, title, color=_INK, size=15, weight="bold", va="center")
+    count = result["windows"]
+    lively = result["transient"]["windows"]
+    windows = "one window" if count == 1 else f"{count} windows"
+    drawn = "" if shown == count else f", {shown} of them drawn"
+    figure.text(
+        _LEFT,
+        0.927,
+        f"{windows} of {result['horizon_s']:.3g} s{drawn}; {lively} in which something changes."
+        "   In brackets: the errors of predicting that nothing changes.",
+        color=_SOFT,
+        size=10.5,
+        va="center",
+    )
+    for right, words, colour in (
+        (0.865, "measured", _MEASURED),
+        (_RIGHT, "simulated", _SIMULATED),
+    ):
+        figure.text(right, 0.927, words, color=colour, size=11, va="center", ha="right")
+        figure.add_artist(
+            Line2D(
+                [right - 0.085, right - 0.063],
+                [0.927] * 2,
+                color=colour,
+                linewidth=2.4,
+                marker="o" if colour == _SIMULATED else None,
+                markersize=5,
+                markevery=[0],
+            )
+        )
+
+
+def _write_caption(figure: "Figure", top: float, left: str, right: str) -> None:
+    """Write above a strip what it shows, and how well."""
+    y = top - _CAPTION / 2 - 0.004
+    figure.text(_LEFT, y, left, color=_INK, size=10.5, weight="bold", va="center")
+    figure.text(_RIGHT, y, right, color=_SOFT, size=10, va="center", ha="right")
+
+
+def _dress(axes: "Axes", series: Mapping[str, Any], is_last: bool) -> None:
+    """Prepare a strip: the log's time across, grey where the dead-man switch is released."""
+    time = series["commands"]["time_s"]
+    end = max(float(time[-1]), float(time[0]) + 1e-3)
+    axes.set_xlim(float(time[0]), end)
+    armed = series["armed"]
+    if armed is not None:
+        until = np.append(armed.time[1:], end)
+        for begin, finish in _pieces(armed.value < 0.5):
+            span = (armed.time[begin], until[finish - 1])
+            axes.axvspan(*span, color=_RELEASED, linewidth=0, zorder=0)
+    axes.grid(color=_LINE, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.set_frame_on(False)
+    axes.tick_params(length=0, labelsize=9.5, labelcolor=_SOFT, pad=5, labelbottom=is_last)
+    axes.locator_params(axis="y", nbins=5)
+    if is_last:
+        axes.set_xlabel("time, s  (grey: dead-man switch released)", color=_SOFT, size=9.5)
+
+
+def _draw_quantity(
+    axes: "Axes", series: Mapping[str, Any], name: str, shown: Iterable[int]
+) -> None:
+    """Draw a quantity as measured, and as simulated from the starts of the windows shown."""
+    signal = series["measured"][name]
+    axes.plot(signal.time, signal.value, color=_MEASURED, linewidth=2.2, zorder=2)
+    within = (signal.time >= axes.get_xlim()[0]) & (signal.time <= axes.get_xlim()[1])
+    seen = [signal.value[within]]
+    for i in shown:
+        window: Window = series["windows"][i]
+        if name not in window:
+            continue
+        time, simulated = window[name].time, window[name].simulated
+        start = series["starts_s"][i]
+        time = np.concatenate([[start], time])
+        simulated = np.concatenate([window[name].unchanged[:1], simulated])
+        axes.plot(time, simulated, color=_SIMULATED, linewidth=1.5, zorder=3)
+        axes.plot(time[:1], simulated[:1], "o", color=_SIMULATED, markersize=3.2, zorder=3)
+        seen.append(simulated)
+    low, high = np.nanmin(np.concatenate(seen)), np.nanmax(np.concatenate(seen))
+    span = max(float(high - low), 0.1)
+    axes.set_ylim(low - 0.06 * span, high + 0.06 * span)
+
+
+def _draw_commands(axes: "Axes", commands: Table) -> None:
+    """Draw throttle on the left scale and steering on the right one."""
+    time, throttle = commands["time_s"], 100 * commands["throttle"]
+    axes.step(time, throttle, where="post", color=_INK, linewidth=1.3)
+    top = max(100.0, float(np.max(np.abs(throttle))))
+    axes.set_ylim(-1.06 * top if np.min(throttle) < 0 else -0.06 * top, 1.06 * top)
+    axes.set_ylabel("throttle, %", color=_INK, size=9.5)
+    right = axes.twinx()
+    degrees = np.degrees(commands["steering"])
+    right.step(time, degrees, where="post", color=_STEERED, linewidth=1.3)
+    most = max(10.0, float(np.max(np.abs(degrees))))
+    right.set_ylim(-1.08 * most, 1.08 * most)
+    right.set_ylabel("steering asked for, °", color=_STEERED, size=9.5)
+    right.set_frame_on(False)
+    right.tick_params(length=0, labelsize=9.5, labelcolor=_STEERED, pad=5)
+    right.locator_params(axis="y", nbins=5)

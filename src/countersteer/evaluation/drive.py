@@ -18,7 +18,6 @@ from countersteer.evaluation.turns import Judge, sideslip, summary
 from countersteer.runs.files import TRUTH
 from countersteer.runs.writer import WHEELS, Rows, RunWriter
 from countersteer.simulator import Record, Simulator
-from countersteer.viewing.report import report_html
 
 COUNTS = ("turn", "wall_contacts")
 TRUTH_PERIOD = 0.005  # s between two rows of truth.csv
@@ -229,7 +228,7 @@ def drive(
     longest: float,
     report: Callable[[float, float], None],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Drives to the goal, or for `longest` seconds, and writes the run's folder but its picture.
+    """Drives to the goal, or for `longest` seconds, and writes the run's folder but its pictures.
 
     Returns the summary and what the pictures show. `report` is told the progress (m or s). On an
     interrupt the files are ended, and the drive counts as interrupted.
@@ -261,6 +260,4 @@ def drive(
         truth = {n: np.concatenate([log.truth[n] for log in logs]) for n in (*TRUTH, *COUNTS)}
         result = summary(simulator.course, laps, status, truth, contacts)
         writer.finish(result)
-    view = make_view(simulator, about, result, logs)
-    (folder / "report.html").write_text(report_html(view))
-    return result, view
+    return result, make_view(simulator, about, result, logs)

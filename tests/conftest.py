@@ -1,0 +1,148 @@
+"""What the tests share: 64-bit floats, JAX's cache on disk, and programs that compile once."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from countersteer.car.car import Car
+from countersteer.simulator import keep_programs
+from countersteer.world import planar
+from countersteer.world.state import Motion, State
+
+LANES = 32  # cars in a batch: always as many, so that there is one program
+PIECE = 100  # ticks that a call of it takes
+ROWS = 8  # walls of each car
+SLOTS = 512  # of the delay lines: 20 ms at the finest step
+UNFUSED = {"xla_disable_hlo_passes": "fusion"}  # compiles in a fraction of the time
+
+
+@pytest.fixture(scope="session", autouse=True)
+def session() -> Iterator[None]:
+    keep_programs()
+    with jax.enable_x64(True):
+        yield
+
+
+class Drive(NamedTuple):
+    """What came of a batch: arrays of (ticks, cars)."""
+
+    motion: Motion
+    energy: np.ndarray  # J, after the tick
+    airborne: np.ndarray
+    wall_contacts: np.ndarray
+    rolled_over: np.ndarray
+    last: State  # the cars' states at the end, (cars, ...)
+
+
+def stacked(trees: list) -> object:
+    """A batch of like pytrees."""
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
+
+
+def varied(car: Car, changes: dict[str, float]) -> Car:
+    """The car with parameters replaced by dotted name, in the units used inside."""
+    for path, value in changes.items():
+        *rooms, name = path.split(".")
+        parts = [car]
+        for room in rooms:
+            parts.append(getattr(parts[-1], room))
+        part = dataclasses.replace(parts[-1], **{name: np.float64(value)})
+        for room, holder in zip(reversed(rooms), reversed(parts[:-1]), strict=True):
+            part = dataclasses.replace(holder, **{room: part})
+        car = part
+    return car
+
+
+def start(car: Car, slots: int = SLOTS, **motion: object) -> State:
+    """A car at rest with nothing under way, but for what `motion` says."""
+    state = planar.initial_state(car, 1e-3, slots=slots)
+    return state._replace(motion=state.motion._replace(**motion))
+
+
+def _advance(cars, walls, state, throttle, steering, first, dt):
+    def tick(state, inputs):
+        count, *command = inputs
+        state = jax.vmap(planar.step, (0, 0, 0, 0, None, None))(
+            cars, walls, state, planar.Command(*command), count, dt
+        )
+        return state, (state.motion, state.airborne, state.wall_contacts, state.rolled_over)
+
+    counts = first + jnp.arange(throttle.shape[0], dtype=jnp.int32)
+    state, (motion, *rest) = jax.lax.scan(tick, state, (counts, throttle, steering))
+
+    def energy(car, motion):
+        velocity = planar.Vector(motion.vx, motion.vy, motion.yaw_rate)
+        return planar.kinetic_energy(car, velocity, motion.wheels)
+
+    return state, (motion, jax.vmap(energy, (0, 1), 1)(cars, motion), *rest)
+
+
+@pytest.fixture(scope="session")
+def drive() -> Callable[..., Drive]:
+    """Drives up to 32 cars at once: cars, states, commands, walls, step and number of ticks.
+
+    A command is a number, an array by car, or an array (ticks, cars); walls are (n, 4) for all or
+    (cars, n, 4). `every` thins the record. There is one program for each precision.
+    """
+    program = jax.jit(_advance)
+
+    def run(
+        cars: list[Car],
+        states: list[State],
+        ticks: int,
+        dt: float,
+        throttle: object = 0.0,
+        steering: object = 0.0,
+        walls: np.ndarray | None = None,
+        every: int = 1,
+    ) -> Drive:
+        count = len(cars)
+        assert count <= LANES
+        assert ticks % PIECE == 0
+        dtype = np.asarray(cars[0].body.mass).dtype
+        fill = [i % count for i in range(LANES)]
+        batch = stacked([cars[i] for i in fill])
+        state = jax.tree.map(jnp.asarray, stacked([states[i] for i in fill]))
+        around = np.full((LANES, ROWS, 4), np.nan, dtype)
+        if walls is not None:
+            walls = np.broadcast_to(walls, (count, *np.shape(walls)[-2:]))
+            around[:, : walls.shape[1]] = walls[fill]
+        commands = [
+            np.broadcast_to(np.asarray(command, dtype), (ticks, count))[:, fill]
+            for command in (throttle, steering)
+        ]
+        kept, seconds = [], jnp.asarray(dt, dtype)
+        for piece in range(ticks // PIECE):
+            span = slice(piece * PIECE, (piece + 1) * PIECE)
+            state, record = program(
+                batch, around, state, *(c[span] for c in commands), np.int32(span.start), seconds
+            )
+            first = -(span.start + 1) % every  # so that ticks every, 2 every, ... are kept
+            kept.append(jax.tree.map(lambda leaf, n=first: np.asarray(leaf)[n::every], record))
+        whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:, :count], *kept)
+        last = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], state)
+        return Drive(*whole, last)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def drive_alone() -> Callable[..., Motion]:
+    """One car, without a batch: the motion after each tick."""
+
+    def advance(car, walls, state, throttle, steering, dt):
+        def tick(state, inputs):
+            count, *command = inputs
+            state = planar.step(car, walls, state, planar.Command(*command), count, dt)
+            return state, state.motion
+
+        counts = jnp.arange(throttle.shape[0], dtype=jnp.int32)
+        return jax.lax.scan(tick, state, (counts, throttle, steering))[1]
+
+    program = jax.jit(advance, compiler_options=UNFUSED)
+    return lambda *arguments: jax.tree.map(np.asarray, program(*arguments))

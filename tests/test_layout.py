@@ -1,0 +1,103 @@
+"""The rooms of the package: who may import whom, and what the README promises."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "countersteer"
+
+EVERYONE = {"errors", "__init__"}
+MAY_IMPORT = {
+    "car": set(),
+    "course": {"car"},
+    "world": {"car", "course"},
+    "sensing": {"car", "course", "world"},  # sensors look at the world's state
+    "link": {"car"},
+    "estimation": {"car", "course", "world", "sensing"},
+    "drivers": {"car", "course", "world", "estimation"},
+    "simulator": {"car", "course", "world", "sensing", "link", "estimation", "drivers"},
+    "runs": {"car", "course"},
+    "evaluation": {
+        "car", "course", "world", "sensing", "simulator", "runs",
+    },
+    "viewing": {"runs", "simulator"},
+    "cli": None,
+}  # fmt: skip
+
+
+def room(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imported(path: Path) -> set[str]:
+    rooms = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            parts = name.split(".")
+            if parts[0] == "countersteer" and len(parts) > 1:
+                rooms.add(parts[1])
+    return rooms
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: p.stem)
+def test_imports_run_one_way(path):
+    here = room(path)
+    if here in EVERYONE:
+        assert not imported(path) - EVERYONE
+        return
+    allowed = MAY_IMPORT[here]
+    if allowed is not None:
+        wrong = imported(path) - allowed - EVERYONE - {here, "__version__"}
+        assert not wrong, f"{here} may not import {wrong}"
+
+
+def test_nothing_that_is_read_is_executed():
+    for path in PACKAGE.rglob("*.py"):
+        names = {
+            node.func.id
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        assert not names & {"eval", "exec", "compile", "__import__"}, path
+        assert "pickle" not in path.read_text(), path
+
+
+def test_every_command_of_the_readme_is_a_command():
+    from countersteer.cli import parser
+
+    text = (ROOT / "README.md").read_text()
+    commands = re.findall(r"`countersteer ([^`]+)`", text)
+    assert len(commands) >= 5
+    for command in commands:
+        parser().parse_args(command.split())
+
+
+def test_what_the_readme_links_to_is_there():
+    for target in re.findall(r"\]\((?!http)([^)#]+)\)", (ROOT / "README.md").read_text()):
+        assert (ROOT / target).exists(), target
+
+
+def test_pins_carry_names_and_versions_only():
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line), line
+
+
+def test_every_exception_to_the_linter_says_why():
+    text = (ROOT / "pyproject.toml").read_text()
+    tomllib.loads(text)
+    for line in text.splitlines():
+        if re.match(r'\s*"[A-Z]+[0-9]*",', line):
+            assert "#" in line, line
+    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "tests").glob("*.py")]:
+        for line in path.read_text().splitlines():
+            if re.search(r"# (noqa|type: ignore)", line) and "re.search" not in line:
+                assert re.search(r"(noqa: [A-Z0-9, ]+|type: ignore\[[a-z-]+\])  # \S", line), line
