@@ -89,7 +89,8 @@ def drive() -> Callable[..., Drive]:
     A command is a number, an array by car, or an array (ticks, cars); walls are (n, 4) for all or
     (cars, n, 4). `every` thins the record. There is one program for each precision.
     """
-    program = jax.jit(_advance)
+    wide = jax.jit(_advance)
+    narrow = jax.jit(_advance, compiler_options=UNFUSED)  # slower, but runs once
 
     def run(
         cars: list[Car],
@@ -105,6 +106,7 @@ def drive() -> Callable[..., Drive]:
         assert count <= LANES
         assert ticks % PIECE == 0
         dtype = np.asarray(cars[0].body.mass).dtype
+        program = wide if dtype == np.float64 else narrow
         fill = [i % count for i in range(LANES)]
         batch = stacked([cars[i] for i in fill])
         state = jax.tree.map(jnp.asarray, stacked([states[i] for i in fill]))
