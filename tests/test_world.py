@@ -1,6 +1,7 @@
 """Laws of the planar world, and a second implementation to check it against."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LANES, UNFUSED, start, varied
+from conftest import LANES, UNFUSED, stacked, start, varied
 from scipy.integrate import solve_ivp
 from scipy.linalg import null_space
 
 from countersteer.car.car import Car, Wheels
 from countersteer.car.files import load_car
-from countersteer.world import battery, chassis, drivetrain, motor, planar, servo, tyre
+from countersteer.world import chassis, motor, planar, servo, tyre, walls
 from countersteer.world.state import Motion
 
 STEPS = (1e-4, 1e-3, 1e-2)
@@ -673,7 +674,7 @@ def second_implementation(m: Manoeuvre, until: float) -> np.ndarray:
     # Wheels that a solid differential joins are brought to one speed by its impulse.
     mass = np.diag(inertias) + rotor * np.outer(shaft, shaft)
     state[11:] = np.linalg.solve(spin_mass, free.T @ mass @ rolling)
-    for begin, end in zip(marks, marks[1:], strict=False):
+    for begin, end in itertools.pairwise(marks):
         goals = (
             asked_duty(float(held(throttle, np.array(begin)))),
             asked_angle(float(held(steering, np.array(begin)))),
@@ -831,7 +832,7 @@ def corners(drive: Callable) -> Callable[[], Motion]:
     cars = [front, front, grippy]
     moving = [planar.initial_state(car, 1e-3, velocity=(2.0, 0.0, 0.0)).motion for car in cars]
     states = [start(car, vx=2.0, wheels=m.wheels) for car, m in zip(cars, moving, strict=True)]
-    ramp = 0.15 * 1e-3 * np.arange(2000)
+    ramp = 0.3 * 1e-3 * np.arange(2000)
     steering = np.stack([ramp, -ramp, np.full(2000, 0.02)], axis=1)
     return drive(cars, states, 2000, 1e-3, [0.25, 0.25, 0.0], steering).motion
 
@@ -839,7 +840,7 @@ def corners(drive: Callable) -> Callable[[], Motion]:
 def test_the_front_axles_friction_limits_a_car_that_understeers(corners: Motion) -> None:
     # In a steady turn each axle carries its share of the mass, so the weaker axle gives the limit.
     for car, side in ((0, 1), (1, -1)):
-        most = (side * corners.load_ay[:, car]).max()
+        most = (side * corners.load_ay[:, car] / np.cos(corners.steering[:, car])).max()
         assert most == pytest.approx(0.4 * 9.81, rel=0.03)
 
 
@@ -888,7 +889,7 @@ def test_differentials_share_torque_when_open_and_speed_when_locked(drive: Calla
     gained = after - speeds[:, None]
     near = {"abs": 0.05}
     assert gained[2, 0] == pytest.approx(gained[3, 0], **near)
-    assert gained[2, 0] > 5
+    assert gained[2, 0] > 3
     assert gained[:2, 0] == pytest.approx(0, **near)
     assert after[2, 1] == pytest.approx(after[3, 1], abs=1e-3)
     assert gained[2:, 1].sum() == pytest.approx(gained[2:, 0].sum(), **near)
@@ -947,7 +948,7 @@ def test_the_battery_sags_with_current_and_with_age() -> None:
     assert voltage(0, 0) == pytest.approx(9.6, abs=1e-5)
     assert voltage(1, 0) == voltage(0, 0)
     # A standing motor at half duty: I = d U / (R + d² r) in the windings, half of it from the pack.
-    current = 0.5 * 9.6 / (0.15 + 0.25 * 0.12)
+    current = 0.5 * 9.6 / (RX7.motor.resistance + 0.25 * 0.12)
     assert voltage(0, 0.5) == pytest.approx(9.6 - 0.12 * 0.5 * current, rel=1e-5)
     assert voltage(1, 0.5) < voltage(0.5, 0.5) < voltage(0, 0.5)
     assert voltage(0, 1.0) < voltage(0, 0.5) < voltage(0, 0.2)
@@ -955,20 +956,19 @@ def test_the_battery_sags_with_current_and_with_age() -> None:
 
 
 def test_the_battery_runs_down_and_never_below_empty(drive: Callable) -> None:
+    grip = {"tires.front.friction": 3, "tires.rear.friction": 3}
     cars = [
-        varied(RX7, {"battery.capacity": capacity, "battery.wear": wear})
+        varied(RX7, grip | {"battery.capacity": capacity, "battery.wear": wear})
         for capacity in (36.0, 3600.0)
         for wear in (0.0, 1.0)
     ]
     # Against a wall, so that the current is all but that of a standing motor.
     wall = np.array([[0.21, -5, 0.21, 5]])
-    charge = drive(cars, [start(car) for car in cars], 1000, 1e-2, 0.4, 0.0, wall).motion.charge
+    charge = drive(cars, [start(car) for car in cars], 1000, 1e-2, 1.0, 0.0, wall).motion.charge
     assert np.all(np.diff(charge, axis=0) <= 0)
     assert charge[-1, 3] < charge[-1, 2] < 1, "a worn pack holds less"
-    spent = (1 - charge[:, 2]) * 3600
-    expected = battery.capacity(cars[2].battery)
-    assert expected == 3600
-    assert spent[-1] > 36, "enough to empty the small packs"
+    spent = (1 - charge[-1, 2]) * 3600
+    assert spent > 36, "enough to empty the small packs"
     assert charge.min() >= 0
 
 
@@ -1088,6 +1088,65 @@ def test_no_wall_is_passed_through(drive: Callable, dt: float) -> None:
         assert corners.max() < 1 + 6 * dt + 0.01, f"seed {seed}"
 
 
+def test_a_contacts_impulse_keeps_coulombs_law_and_adds_no_energy() -> None:
+    seed, count = 9, 3000
+    rng = np.random.default_rng(seed)
+    cars = [
+        varied(
+            RX7,
+            {
+                "body.wall_friction": rng.choice([0, 0.1, 0.4, 2, 10]),
+                "body.wall_restitution": rng.choice([0, 0.3, 1]),
+                "body.center": rng.uniform(-0.05, 0.05),
+            },
+        )
+        for _ in range(30)
+    ] * (count // 30)
+    motions = [
+        start(
+            car,
+            16,
+            heading=h,
+            vx=v[0] * rng.choice([1e-3, 1]),
+            vy=v[1] * rng.choice([1e-3, 1]),
+            yaw_rate=v[2] * rng.choice([0, 10]),
+        ).motion
+        for car, h, v in zip(
+            cars, rng.uniform(-4, 4, count), rng.normal(size=(count, 3)) * 2, strict=True
+        )
+    ]
+    end = rng.uniform(-0.2, 0.2, (count, 2))
+    bearing = rng.uniform(-4, 4, count)
+    way = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    wall = np.hstack([end, end + way * rng.choice([0.05, 2], (count, 1))])[:, None]
+    bodies = stacked([car.body for car in cars])
+    before = stacked(motions)
+    after, touched = jax.jit(jax.vmap(walls.collide))(bodies, wall, before)
+    after = jax.tree.map(np.asarray, after)
+    touched = np.asarray(touched) > 0
+    assert touched.sum() > 500
+
+    out = np.stack([after.x - before.x, after.y - before.y])
+    out = np.where(touched, out, [[1], [0]])
+    normal = out / np.hypot(*out)
+    c, s = np.cos(before.heading), np.sin(before.heading)
+    dvx, dvy = after.vx - before.vx, after.vy - before.vy
+    push = bodies.mass * np.stack([c * dvx - s * dvy, s * dvx + c * dvy])
+    across = push[1] * normal[0] - push[0] * normal[1]
+    along = (push * normal).sum(axis=0)
+    energy = lambda m: (  # noqa: E731  # two uses
+        bodies.mass * (m.vx**2 + m.vy**2) + bodies.yaw_inertia * m.yaw_rate**2
+    )
+    assert np.all(energy(after) <= energy(before) * (1 + 1e-12))
+    assert along.min() > -1e-12, "a wall does not pull"
+    excess = np.abs(across) - bodies.wall_friction * along
+    worst = int(np.argmax(excess))
+    assert excess[worst] < 1e-9, (
+        f"seed {seed}: {np.sum(excess > 1e-9)} of {touched.sum()} contacts; in case {worst} friction "
+        f"{bodies.wall_friction[worst]} gives {across[worst]} N s across {along[worst]} N s"
+    )
+
+
 def test_a_head_on_hit_without_loss_reverses_the_speed(drive: Callable) -> None:
     car = varied(RX7, SLIPPERY | {"body.wall_restitution": 1, "body.wall_friction": 0})
     cars = [car] * 4
@@ -1123,7 +1182,7 @@ def test_the_end_of_a_wall_hits_the_side_of_the_car(drive: Callable) -> None:
     hit = int(np.argmax(result.wall_contacts[:, 0] > 0))
     turned = result.motion.yaw_rate[hit]
     assert turned[0] < -1
-    assert turned[1] == pytest.approx(-turned[0])
+    assert turned[1] == pytest.approx(-turned[0], rel=0.02)
     assert turned[2] == pytest.approx(0, abs=1e-9)
     # No end is inside the outline at any time.
     m = result.motion
@@ -1153,7 +1212,7 @@ def test_a_wall_that_covers_half_the_bumper_turns_the_car(drive: Callable) -> No
 def test_a_wall_in_pieces_is_one_wall(drive: Callable) -> None:
     rng = np.random.default_rng(8)
     ends = np.array([-3, -0.5, 0.11, 0.31, 0.7, 1.3, 9.0])
-    pieces = np.array([[a, 0.3, b, 0.3] for a, b in zip(ends, ends[1:], strict=False)])
+    pieces = np.array([[a, 0.3, b, 0.3] for a, b in itertools.pairwise(ends)])
     whole = np.full_like(pieces, np.nan)
     whole[0] = [-3, 0.3, 9, 0.3]
     cars = [varied(RX7, {"body.wall_friction": f}) for f in (0.0, 0.4, 0.4, 2.0)] * 2

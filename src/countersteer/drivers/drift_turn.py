@@ -139,14 +139,14 @@ def drift_turn(course: Course, car: Car, speed: float | None = None, laps: int =
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn."""
     turns = course.turns_ahead(laps)
     marks = [course.start_distance] + [t.distance for t in turns]
-    names = car.sensors.sonar.mount_names
-    front = names.index("front")
+    sonar = car.sensors.sonar
+    front = straighten.mount_number(car, "front")
     return DriftTurn(
         straight=straighten.straighten(course, car, SPEED if speed is None else speed),
         angles=np.array([t.angle for t in turns] + [0.0]),
         gaps=np.append(np.diff(marks), np.inf),
-        front_x=car.sensors.sonar.mounts[front].x,
+        front_x=sonar.mounts[front].x,
         width=course.width or 1.0,
-        ping=1 / car.sensors.sonar.rate,
+        ping=(len(sonar.mounts) if sonar.firing == "in-turn" else 1) / sonar.rate,
         front=front,
     )

@@ -11,6 +11,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Command, Observation
+from countersteer.errors import InputError
 
 SPEED = 1.5  # m/s, unless another is asked for
 
@@ -96,8 +97,7 @@ class Straighten:
 def straighten(course: Course, car: Car, speed: float | None = None) -> Straighten:
     """For a course and a nominal car; `speed` in m/s."""
     speed = SPEED if speed is None else speed
-    names = car.sensors.sonar.mount_names
-    left, right = names.index("left"), names.index("right")
+    left, right = mount_number(car, "left"), mount_number(car, "right")
     mounts = car.sensors.sonar.mounts
     return Straighten(
         speed=speed,
@@ -113,6 +113,14 @@ def straighten(course: Course, car: Car, speed: float | None = None) -> Straight
         left=left,
         right=right,
     )
+
+
+def mount_number(car: Car, name: str) -> int:
+    """Where a sonar of this name is among the car's mounts. Raises `InputError`."""
+    names = car.sensors.sonar.mount_names
+    if name not in names:
+        raise InputError(f"the driver needs a sonar mount {name}; the car has {', '.join(names)}")
+    return names.index(name)
 
 
 def holding_throttle(car: Car, speed: float) -> float:

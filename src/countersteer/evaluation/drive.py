@@ -14,7 +14,7 @@ import numpy as np
 from countersteer.car.car import wheel_positions
 from countersteer.car.files import car_tables
 from countersteer.course.files import course_tables
-from countersteer.evaluation.turns import Judge, sideslip, summary
+from countersteer.evaluation.turns import Judge, going_straight, sideslip, summary
 from countersteer.runs.files import TRUTH
 from countersteer.runs.writer import WHEELS, Rows, RunWriter
 from countersteer.simulator import Record, Simulator
@@ -43,7 +43,8 @@ class Log:
         shown = np.nonzero(ticks % max(1, round(TRUTH_PERIOD / dt)) == 0)[0]
         time, motion = ticks * dt, record.motion
         end, status = len(ticks), None
-        finish = judge.follow(time[shown], motion.x[shown], motion.y[shown])
+        calm = going_straight(motion.vx[shown], motion.vy[shown], motion.yaw_rate[shown])
+        finish = judge.follow(time[shown], motion.x[shown], motion.y[shown], calm)
         for ends, reached in (
             (finish is not None, "goal reached"),
             (np.any(record.rolled_over), "rolled over"),
@@ -258,6 +259,6 @@ def drive(
         if judge.goal is None and status == "out of time":
             status = "done"
         truth = {n: np.concatenate([log.truth[n] for log in logs]) for n in (*TRUTH, *COUNTS)}
-        result = summary(simulator.course, laps, status, truth, contacts)
+        result = summary(judge, laps, status, truth, contacts)
         writer.finish(result)
     return result, make_view(simulator, about, result, logs)

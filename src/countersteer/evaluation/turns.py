@@ -49,7 +49,7 @@ def find_turns(
     that at the end, less the outgoing corridor's.
     """
     slip = sideslip(vx, vy)
-    calm = (np.abs(yaw_rate) < STRAIGHT_RATE) & (np.abs(slip) < STRAIGHT_SLIP)
+    calm = going_straight(vx, vy, yaw_rate)
     results = []
     bearing = course.start[2]
     for number, corner in enumerate(course.turns_ahead(laps), start=1):
@@ -84,7 +84,10 @@ def find_turns(
 
 
 class Judge:
-    """Follows a drive while it runs: how far it came, and whether it is over."""
+    """Follows a drive while it runs: how far it came, and whether it is over.
+
+    A drive that has reached its goal runs on until the turn that it is in, if any, has ended.
+    """
 
     STALLED = 5.0  # s without a step ahead
 
@@ -94,33 +97,50 @@ class Judge:
         self.goal = course.lap_end(laps) if course else None
         self.distance = course.start_distance if course else 0.0
         self.furthest, self.since = self.distance, 0.0
+        self.goal_time: float | None = None
+        self.stirred = 0.0  # last time at which the car was not going straight
 
-    def follow(self, time: np.ndarray, x: np.ndarray, y: np.ndarray) -> int | None:
-        """Index of the sample at which the goal was reached, if it was among these."""
+    def follow(
+        self, time: np.ndarray, x: np.ndarray, y: np.ndarray, calm: np.ndarray
+    ) -> int | None:
+        """Index of the sample at which the drive is over, if it is among these."""
         if self.course is None or self.goal is None:
             return None
         walked = progress(self.course, x, y, self.distance)
         self.distance = float(walked[-1])
-        for t, d in zip(time, walked, strict=True):
-            if d > self.furthest + 0.05:
-                self.furthest, self.since = d, float(t)
-        there = np.nonzero(walked >= self.goal - 1e-9)[0]
-        return int(there[0]) if len(there) else None
+        for i, (now, distance, straight) in enumerate(zip(time, walked, calm, strict=True)):
+            if distance > self.furthest + 0.05:
+                self.furthest, self.since = distance, float(now)
+            if not straight:
+                self.stirred = float(now)
+            if self.goal_time is None and distance >= self.goal - 1e-9:
+                self.goal_time = float(now)
+            if self.goal_time is not None and (
+                now - self.stirred >= STRAIGHT_FOR - 1e-9 or now - self.goal_time >= LONGEST
+            ):
+                return i
+        return None
 
     def stalled(self, time: float) -> bool:
         """Whether the car has stopped getting ahead."""
-        return self.goal is not None and time - self.since > self.STALLED
+        return (
+            self.goal is not None and self.goal_time is None and time - self.since > self.STALLED
+        )
+
+
+def going_straight(vx: np.ndarray, vy: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
+    """Where yaw rate and sideslip are both under what ends a turn."""
+    return (np.abs(yaw_rate) < STRAIGHT_RATE) & (np.abs(sideslip(vx, vy)) < STRAIGHT_SLIP)
 
 
 def summary(
-    course: Course | None, laps: int, status: str, table: dict[str, np.ndarray], contacts: int
+    judge: Judge, laps: int, status: str, table: dict[str, np.ndarray], contacts: int
 ) -> dict[str, Any]:
     """The JSON of a drive: `table` holds columns of `truth.csv` and `turn`."""
-    time = table["time_s"]
     turns = (
         find_turns(
-            course,
-            time,
+            judge.course,
+            table["time_s"],
             table["heading_rad"],
             table["vx_mps"],
             table["vy_mps"],
@@ -128,7 +148,7 @@ def summary(
             table["turn"],
             laps,
         )
-        if course is not None
+        if judge.course is not None
         else []
     )
     completed = status == "goal reached"
@@ -137,6 +157,6 @@ def summary(
         "success": completed and contacts == 0,
         "status": status,
         "wall_contacts": contacts,
-        "lap_time_s": float(time[-1]) if completed else None,
+        "lap_time_s": judge.goal_time if completed else None,
         "turns": [dataclasses.asdict(turn) for turn in turns],
     }
