@@ -18,12 +18,13 @@ LANES = 32  # cars in a batch: always as many, so that there is one program
 PIECE = 100  # ticks that a call of it takes
 ROWS = 8  # walls of each car
 SLOTS = 512  # of the delay lines: 20 ms at the finest step
-UNFUSED = {"xla_disable_hlo_passes": "fusion"}  # compiles in a fraction of the time
+
+
+keep_programs()  # before anything computes: it sets how to compile
 
 
 @pytest.fixture(scope="session", autouse=True)
 def session() -> Iterator[None]:
-    keep_programs()
     with jax.enable_x64(True):
         yield
 
@@ -89,8 +90,7 @@ def drive() -> Callable[..., Drive]:
     A command is a number, an array by car, or an array (ticks, cars); walls are (n, 4) for all or
     (cars, n, 4). `every` thins the record. There is one program for each precision.
     """
-    wide = jax.jit(_advance)
-    narrow = jax.jit(_advance, compiler_options=UNFUSED)  # slower, but runs once
+    program = jax.jit(_advance)
 
     def run(
         cars: list[Car],
@@ -106,7 +106,6 @@ def drive() -> Callable[..., Drive]:
         assert count <= LANES
         assert ticks % PIECE == 0
         dtype = np.asarray(cars[0].body.mass).dtype
-        program = wide if dtype == np.float64 else narrow
         fill = [i % count for i in range(LANES)]
         batch = stacked([cars[i] for i in fill])
         state = jax.tree.map(jnp.asarray, stacked([states[i] for i in fill]))
@@ -146,5 +145,5 @@ def drive_alone() -> Callable[..., Motion]:
         counts = jnp.arange(throttle.shape[0], dtype=jnp.int32)
         return jax.lax.scan(tick, state, (counts, throttle, steering))[1]
 
-    program = jax.jit(advance, compiler_options=UNFUSED)
+    program = jax.jit(advance)
     return lambda *arguments: jax.tree.map(np.asarray, program(*arguments))

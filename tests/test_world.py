@@ -10,14 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LANES, UNFUSED, stacked, start, varied
 from scipy.integrate import solve_ivp
 from scipy.linalg import null_space
 
+from conftest import LANES, stacked, start, varied
 from countersteer.car.car import Car, Wheels
 from countersteer.car.files import load_car
-from countersteer.world import chassis, motor, planar, servo, tyre, walls
+from countersteer.world import chassis, motor, planar, servo, tyre
 from countersteer.world.state import Motion
+from countersteer.world.walls import collide
 
 STEPS = (1e-4, 1e-3, 1e-2)
 RX7 = load_car("rx7")
@@ -275,7 +276,7 @@ def gradients() -> tuple[list[str], np.ndarray, tuple, Callable]:
         motion = jax.tree.map(np.float64, start(car, 16, **motion).motion)
         commands = np.full(50, throttle), np.full(50, steering)
         rows.append(((car, motion, *commands), around))
-    program = jax.jit(jax.vmap(jax.value_and_grad(_far), (0, 0, None)), compiler_options=UNFUSED)
+    program = jax.jit(jax.vmap(jax.value_and_grad(_far), (0, 0, None)))
     weights = np.array([1.0, 2.0, 3.0])
     args, around = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
     values, grads = program(args, around, weights)
@@ -427,7 +428,7 @@ ODD = {
 MANOEUVRES = {
     "launch": Manoeuvre(RX7, (0, 0, 0), {0.0: 1.0}, {0.0: 0.0}),
     "full lock": Manoeuvre(RX7, (1.6, 0, 0), {0.0: 0.35}, {0.0: 0.0, 0.1: 0.5}),
-    "drift": Manoeuvre(RX7, (2.0, -0.7, 4.5), {0.0: 0.6}, {0.0: 0.0, 0.25: -0.2}),
+    "drift": Manoeuvre(RX7, (1.5, -0.675, 3.3), {0.0: 0.7}, {0.0: -0.3}),
     "braking slide": Manoeuvre(RX7, (2.2, 0.5, 2.0), {0.0: -1.0, 0.6: 0.0}, {0.0: 0.15}),
     "swerve": Manoeuvre(RX7, (1.5, 0, 0), {0.0: 0.7}, {0.0: 0.35, 0.4: -0.3}),
     "rear drive": Manoeuvre(
@@ -475,7 +476,7 @@ MANOEUVRES = {
     ),
 }
 CONVERGED = ("launch", "full lock", "drift", "braking slide")
-SECOND = ("rear drive", "front drive", "all drive", "swerve", "braking slide")
+SECOND = ("drift", "rear drive", "front drive", "all drive", "swerve", "braking slide")
 
 
 def position_error(a: np.ndarray, b: np.ndarray) -> float:
@@ -521,6 +522,9 @@ FINE = 5e-5
 @pytest.mark.parametrize("name", CONVERGED)
 def test_a_second_at_one_millisecond_is_within_a_millimetre(final: Callable, name: str) -> None:
     error = position_error(final(1e-3)[name][-1], final(FINE)[name][-1])
+    if name == "drift":
+        sideslip = np.arctan2(final(FINE)[name][:, 4], final(FINE)[name][:, 3])
+        assert np.degrees(sideslip[:8]).max() < -20, "it no longer drifts for 0.8 s"
     assert error < 1e-3, f"{error * 1e3:.3f} mm"
 
 
@@ -552,7 +556,7 @@ def test_nothing_diverges_at_ten_milliseconds(final: Callable) -> None:
 
 
 def second_implementation(m: Manoeuvre, until: float) -> np.ndarray:
-    """x, y, heading after `until` seconds by a stiff solver, locked differentials as constraints."""
+    """x, y, heading after `until` seconds by a stiff solver, with solid shafts as constraints."""
     car = m.car
     body, line, esc, pack, links = car.body, car.drivetrain, car.motor, car.battery, car.servo
     tires = [car.tires.front] * 2 + [car.tires.rear] * 2
@@ -948,8 +952,8 @@ def test_the_battery_sags_with_current_and_with_age() -> None:
     assert voltage(0, 0) == pytest.approx(9.6, abs=1e-5)
     assert voltage(1, 0) == voltage(0, 0)
     # A standing motor at half duty: I = d U / (R + d² r) in the windings, half of it from the pack.
-    current = 0.5 * 9.6 / (RX7.motor.resistance + 0.25 * 0.12)
-    assert voltage(0, 0.5) == pytest.approx(9.6 - 0.12 * 0.5 * current, rel=1e-5)
+    current = 0.5 * 9.6 / (RX7.motor.resistance + 0.25 * RX7.battery.resistance)
+    assert voltage(0, 0.5) == pytest.approx(9.6 - RX7.battery.resistance * 0.5 * current, rel=1e-5)
     assert voltage(1, 0.5) < voltage(0.5, 0.5) < voltage(0, 0.5)
     assert voltage(0, 1.0) < voltage(0, 0.5) < voltage(0, 0.2)
     assert voltage(0, 0.5, 0.0) < voltage(0, 0.5, 0.2) < voltage(0, 0.5, 0.9)
@@ -1121,7 +1125,7 @@ def test_a_contacts_impulse_keeps_coulombs_law_and_adds_no_energy() -> None:
     wall = np.hstack([end, end + way * rng.choice([0.05, 2], (count, 1))])[:, None]
     bodies = stacked([car.body for car in cars])
     before = stacked(motions)
-    after, touched = jax.jit(jax.vmap(walls.collide))(bodies, wall, before)
+    after, touched = jax.jit(jax.vmap(collide))(bodies, wall, before)
     after = jax.tree.map(np.asarray, after)
     touched = np.asarray(touched) > 0
     assert touched.sum() > 500
@@ -1142,7 +1146,7 @@ def test_a_contacts_impulse_keeps_coulombs_law_and_adds_no_energy() -> None:
     excess = np.abs(across) - bodies.wall_friction * along
     worst = int(np.argmax(excess))
     assert excess[worst] < 1e-9, (
-        f"seed {seed}: {np.sum(excess > 1e-9)} of {touched.sum()} contacts; in case {worst} friction "
+        f"seed {seed}: {np.sum(excess > 1e-9)} of {touched.sum()} contacts; in {worst} friction "
         f"{bodies.wall_friction[worst]} gives {across[worst]} N s across {along[worst]} N s"
     )
 
@@ -1223,4 +1227,6 @@ def test_a_wall_in_pieces_is_one_wall(drive: Callable) -> None:
     assert np.all(result.wall_contacts[-1] > 0)
     for name in ("x", "y", "heading", "vx"):
         values = getattr(result.motion, name)
-        np.testing.assert_allclose(values[:, :4], values[:, 4:], atol=1e-9, err_msg=name)
+        # With a side all but flat on the wall, a seam under it may be the least overlap by a
+        # hair: the car is then moved out along its own side, a tenth of a micrometre away.
+        np.testing.assert_allclose(values[:, :4], values[:, 4:], atol=1e-6, err_msg=name)

@@ -14,6 +14,7 @@ the link carries the command, the world takes one step, and the sensors look at 
 import dataclasses
 import math
 import os
+import warnings
 from collections.abc import Generator
 from functools import partial
 from pathlib import Path
@@ -325,6 +326,8 @@ def keep_programs() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {fusion}".strip()
+    # A cache that cannot be read or written is no cache, and nothing to trouble anyone with.
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     jax.config.update("jax_compilation_cache_dir", str(Path(home) / "countersteer" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)

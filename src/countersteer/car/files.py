@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.resources
+import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -70,6 +71,11 @@ def check(car: Car, where: str) -> None:
     body = car.body
     if not body.front_axle < body.wheelbase:
         raise InputError(f"{where}: body.front_axle_m must be less than body.wheelbase_m")
+    servo = car.servo
+    steepest = max(float(servo.limit_left), float(servo.limit_right)) + abs(float(servo.trim))
+    spread = abs(float(servo.ackermann)) * float(body.track) / (2 * float(body.wheelbase))
+    if steepest >= math.pi / 2 or spread * math.tan(steepest) >= 1:
+        raise InputError(f"{where}: [servo] limits, trim and ackermann turn a wheel beyond 90°")
     if not car.motor.dead_zone < car.motor.full_throttle:
         raise InputError(f"{where}: motor.dead_zone must be less than motor.full_throttle")
 

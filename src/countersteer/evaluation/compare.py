@@ -55,7 +55,7 @@ ENCODER_QUANTUM = 0.0413  # m/s
 GYRO_LAG = 0.05  # s
 
 SAMPLE = 0.01  # s between the instants at which states are compared
-PIECE = 250  # ticks in a call of the compiled program, whatever the horizon
+PIECE = 100  # ticks in a call of the compiled program, whatever the horizon
 SIZES = (1, 32, 256)  # windows simulated at once: few, for each is a program of its own
 ENDS = 0.02  # s for which the first and the last sample of a state stand beyond it
 EARLY = 1e-6  # s by which a command may come early, for times that were rounded
@@ -435,16 +435,25 @@ def actuators(
 
     They do not depend on the car's motion: the laws and delays are those of `planar.step`.
     """
-    length = 1 << max(12, math.ceil(math.log2(len(throttle))))  # so that logs share a program
-    padded = [np.pad(line, (0, length - len(line)), mode="edge") for line in (throttle, steering)]
-    angle, duty = _actuators(car, planar.initial_state(car, dt), *padded, dt)
-    return np.asarray(angle)[: len(throttle)], np.asarray(duty)[: len(throttle)]
+    state = planar.initial_state(car, dt)
+    # In pieces: one call for a whole log would be compiled for its length, and be slow besides.
+    missing = -len(throttle) % PIECE
+    padded = [np.pad(line, (0, missing), mode="edge") for line in (throttle, steering)]
+    traces = []
+    for begin in range(0, len(padded[0]), PIECE):
+        count = np.arange(begin, begin + PIECE, dtype=np.int32)
+        piece = (line[begin : begin + PIECE] for line in padded)
+        state, trace = _actuators(car, state, count, *piece, dt)
+        traces.append(np.asarray(trace))
+    angle, duty = np.concatenate(traces, axis=1)[:, : len(throttle)]
+    return angle, duty
 
 
 @partial(jax.jit, static_argnames="dt")
 def _actuators(
-    car: Car, start: State, throttle: jax.Array, steering: jax.Array, dt: float
-) -> tuple[jax.Array, jax.Array]:
+    car: Car, state: State, counts: jax.Array, throttle: jax.Array, steering: jax.Array, dt: float
+) -> tuple[State, tuple[jax.Array, jax.Array]]:
+    """Give the state after so many ticks, and steering angle and duty at the begin of each."""
     no_walls = jnp.full((1, 4), jnp.nan)
 
     def tick(state: State, now: tuple[jax.Array, Command]) -> tuple[State, Any]:
@@ -458,9 +467,7 @@ def _actuators(
         )
         return state._replace(motion=planar.follow(car, state.motion, goal, dt)), begin
 
-    counts = jnp.arange(throttle.shape[0], dtype=jnp.int32)
-    _, (angle, duty) = jax.lax.scan(tick, start, (counts, Command(throttle, steering)))
-    return angle, duty
+    return jax.lax.scan(tick, state, (counts, Command(throttle, steering)))
 
 
 def simulate(
@@ -496,8 +503,8 @@ def _advance(
 
     def tick(states: State, now: tuple[jax.Array, Command]) -> tuple[State, Any]:
         count, command = now
-        step = lambda state, asked: planar.step(car, no_walls, state, asked, count, dt)  # noqa: E731
-        states = jax.vmap(step)(states, command)
+        step = jax.vmap(planar.step, in_axes=(None, None, 0, 0, None, None))
+        states = step(car, no_walls, states, command, count, dt)
         return states, _seen(car, states.motion)
 
     return jax.lax.scan(tick, states, (counts, Command(throttle, steering)))

@@ -183,7 +183,7 @@ def about_run(simulator: Simulator, driver: str, car: str, laps: int) -> dict[st
             "telemetry_s": plan.telemetry * simulator.dt,
             "truth_s": max(1, round(TRUTH_PERIOD / simulator.dt)) * simulator.dt,
         }
-        | {f"{name}_s": ticks * simulator.dt for name, ticks in sensors.items()},
+        | {f"{name}_s": float(ticks) * simulator.dt for name, ticks in sensors.items()},
         "link": {
             "name": link.name,
             "delay_s": link.delay,

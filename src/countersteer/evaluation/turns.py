@@ -123,9 +123,7 @@ class Judge:
 
     def stalled(self, time: float) -> bool:
         """Whether the car has stopped getting ahead."""
-        return (
-            self.goal is not None and self.goal_time is None and time - self.since > self.STALLED
-        )
+        return self.goal is not None and self.goal_time is None and time - self.since > self.STALLED
 
 
 def going_straight(vx: np.ndarray, vy: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:

@@ -19,9 +19,9 @@ def disc_speed(encoder: Encoder, wheels: Wheels, shaft: Scalar) -> Scalar:
     return wheels[("front-left", "front-right", "rear-left", "rear-right").index(encoder.on)]
 
 
-def region(encoder: Encoder, angle: Scalar) -> Scalar:
-    """Number of the region under the eye at a disc's angle (rad)."""
-    return jnp.floor(angle * encoder.regions / jnp.pi)
+def regions_per_second(encoder: Encoder, speed: Scalar) -> Scalar:
+    """Regions that pass the eye, black and white, at a disc's speed (rad/s)."""
+    return speed * encoder.regions / jnp.pi
 
 
 def wheel_speed(encoder: Encoder, radius: Scalar, counts: Scalar, time: Scalar) -> Scalar:

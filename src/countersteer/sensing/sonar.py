@@ -9,6 +9,7 @@ import numpy as np
 from countersteer.car.car import Sonar
 from countersteer.car.parameter import Scalar
 
+PAST = 1e-5  # rad by which a ray passes the end of a wall
 MERGED = 1e-4  # m within which ends of walls are one corner
 
 
@@ -38,9 +39,9 @@ def distances(
     """What each mount reports after a ping, in metres; inf without an echo.
 
     `pose` is x, y, heading of the car; `fires` is 1 for each mount that pings. A wall returns an
-    echo from its point nearest to the foot of the perpendicular, among the points within the cone
-    and seen at no more than `obliqueness`; `corners` (from `edges`) echo by chance each ping.
-    Whatever a wall hides returns nothing. A mount that pings together with others also hears
+    echo from its nearest point within the cone that is seen, at no more than `obliqueness`;
+    `corners` (from `edges`) echo by chance each ping. Whatever a wall hides returns nothing (walls
+    are taken to meet at their ends, if at all). A mount that pings together with others also hears
     their echoes, at half the way out and back, if they come from within `hearing`.
     """
     x, y, bearing = (jnp.stack(values) for values in zip(*_spots(sonar, pose), strict=True))
@@ -112,22 +113,41 @@ def _echo(
     low, high = jnp.maximum(low, 0.0), jnp.minimum(high, length)
     at = jnp.clip(foot, low, high)
     point = start + at[:, None] * along
-    points = jnp.concatenate([point, corners - jnp.stack([x, y])])
+    # Where that point is hidden, the wall may still show beyond the end of what hides it.
+    ends = jnp.concatenate([start, end])
+    past = jnp.concatenate([ends + PAST * _left(ends), ends - PAST * _left(ends)])
+    span = _cross(past[:, None], (end - start)[None])
+    scale = _cross(start, end - start)[None] / jnp.where(jnp.abs(span) > 1e-12, span, jnp.inf)
+    glimpse = scale[..., None] * past[:, None]
+    place = jnp.sum((glimpse - start) * along, axis=-1)
+    glimpsed = (scale > 0) & (place >= low) & (place <= high)
+    points = jnp.concatenate([point, glimpse.reshape(-1, 2), corners - jnp.stack([x, y])])
     reach = jnp.sqrt(jnp.sum(points**2, axis=1) + 1e-18)
     ahead = jnp.cos(bearing) * points[:, 0] + jnp.sin(bearing) * points[:, 1]
     within = ahead > reach * jnp.cos(sonar.half_angle)
-    seen = jnp.concatenate([low <= high, (lit > 0) & within[walls.shape[0] :]])
+    seen = jnp.concatenate(
+        [low <= high, glimpsed.reshape(-1), (lit > 0) & within[-corners.shape[0] :]]
+    )
     seen = seen & ~_hidden(start, end, points)
     reach = jnp.where(seen, reach, jnp.inf)
     nearest = jnp.argmin(reach)
     return reach[nearest], x + points[nearest, 0], y + points[nearest, 1]
 
 
+def _left(vector: jax.Array) -> jax.Array:
+    """Turned by 90° to the left."""
+    return jnp.stack([-vector[..., 1], vector[..., 0]], axis=-1)
+
+
+def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """The cross product's only component."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
 def _hidden(start: jax.Array, end: jax.Array, points: jax.Array) -> jax.Array:
     """Which points, seen from the origin, have a wall before them (not one that they lie on)."""
-    cross = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # noqa: E731  # four uses
     ray, a, b = points[:, None], start[None], end[None]
-    span = cross(ray, b - a)
+    span = _cross(ray, b - a)
     safe = jnp.where(jnp.abs(span) > 1e-12, span, jnp.inf)
-    on_ray, on_wall = cross(a, b - a) / safe, cross(a, ray) / safe
+    on_ray, on_wall = _cross(a, b - a) / safe, _cross(a, ray) / safe
     return jnp.any((on_ray > 1e-6) & (on_ray < 1 - 1e-4) & (on_wall >= 0) & (on_wall <= 1), axis=1)

@@ -1,5 +1,6 @@
 """All sensors of a car on the shared clock."""
 
+from fractions import Fraction
 from typing import NamedTuple
 
 import jax
@@ -33,20 +34,30 @@ class Readings(NamedTuple):
 
 
 class Periods(NamedTuple):
-    """Ticks between two reports."""
+    """Ticks between two reports, as fractions: a period need not be a whole number of ticks."""
 
-    sonar: int
-    encoder: int
-    gyroscope: int
-    accelerometer: int
-    voltmeter: int
+    sonar: Fraction
+    encoder: Fraction
+    gyroscope: Fraction
+    accelerometer: Fraction
+    voltmeter: Fraction
+
+
+def number(every: Fraction, tick: Scalar) -> Scalar:
+    """How many reports were due until this tick."""
+    return tick * every.denominator // every.numerator
+
+
+def due(every: Fraction, tick: Scalar) -> Scalar:
+    """Whether a report is due at this tick."""
+    return number(every, tick) != number(every, tick - 1)
 
 
 class Memory(NamedTuple):
     """What the sensors carry from tick to tick."""
 
     readings: Readings
-    disc: Scalar  # angle of the encoder's disc, rad
+    disc: Scalar  # place of the eye within a region of the encoder's disc, 0 to 1
     counts: Scalar
     counts_before: Scalar  # at the last report
     vx: Scalar  # at the accelerometer's last report
@@ -54,7 +65,7 @@ class Memory(NamedTuple):
 
 
 def periods(car: Car, dt: float) -> Periods:
-    """Each sensor's period in whole ticks, at least one."""
+    """Each sensor's period; none reports more than once a tick."""
     sensors = car.sensors
     times = (
         1 / sensors.sonar.rate,
@@ -63,12 +74,13 @@ def periods(car: Car, dt: float) -> Periods:
         1 / sensors.accelerometer.rate,
         1 / sensors.voltmeter.rate,
     )
-    return Periods(*(max(1, round(float(time) / dt)) for time in times))
+    ticks = (Fraction(float(time) / dt).limit_denominator(100) for time in times)
+    return Periods(*(max(Fraction(1), period) for period in ticks))
 
 
 def initial_memory(car: Car, motion: Motion) -> Memory:
     """Sensors that have not reported yet."""
-    dtype = np.asarray(motion.x).dtype.type
+    dtype = jnp.result_type(motion.x).type
     zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
     no_echo = none._replace(value=dtype(np.inf))
     readings = Readings(tuple(no_echo for _ in car.sensors.sonar.mounts), *[none] * 6)
@@ -89,23 +101,24 @@ def sense(
     """The sensors after a tick. Noise is drawn from `key` and `tick`, once a reading."""
     sensors, readings = car.sensors, memory.readings
     shaft = drivetrain.driven_speed(car, motion.wheels)
-    turned = memory.disc + dt * parts.disc_speed(sensors.encoder, motion.wheels, shaft)
-    passed = jnp.abs(
-        parts.region(sensors.encoder, turned) - parts.region(sensors.encoder, memory.disc)
-    )
-    memory = memory._replace(disc=turned, counts=memory.counts + passed)
+    speed = parts.disc_speed(sensors.encoder, motion.wheels, shaft)
+    turned = memory.disc + dt * parts.regions_per_second(sensors.encoder, speed)
+    passed = jnp.floor(turned)
+    memory = memory._replace(disc=turned - passed, counts=memory.counts + jnp.abs(passed))
     key = jax.random.fold_in(key, tick)
     dtype = jnp.result_type(motion.x)
 
     def ping(readings: Readings) -> Readings:
         mounts = len(sensors.sonar.mounts)
         if sensors.sonar.firing == "in-turn":
-            turn = (tick // every.sonar) % mounts
+            turn = number(every.sonar, tick) % mounts
             fires = tuple(jnp.where(turn == i, 1.0, 0.0) for i in range(mounts))
         else:
             fires = (jnp.asarray(1.0),) * mounts
         pose = (motion.x, motion.y, motion.heading)
-        found = sonar.distances(sensors.sonar, walls, corners, pose, fires, key)
+        found = sonar.distances(
+            sensors.sonar, walls, corners, pose, fires, jax.random.fold_in(key, 4)
+        )
         return readings._replace(
             sonar=tuple(
                 Reading(
@@ -123,7 +136,7 @@ def sense(
 
     def weigh(readings: Readings) -> Readings:
         noise = jax.random.normal(jax.random.fold_in(key, 2), (2,), dtype=dtype)
-        time = every.accelerometer * dt
+        time = (tick - jnp.maximum(readings.accel_x.tick, 0)) * dt
         ax = (motion.vx - memory.vx) / time - motion.yaw_rate * motion.vy
         ay = (motion.vy - memory.vy) / time + motion.yaw_rate * motion.vx
         x, y = parts.accelerometer(sensors.accelerometer, ax, ay, noise)
@@ -131,8 +144,9 @@ def sense(
 
     def count(readings: Readings) -> Readings:
         radius = car.tires.rear.radius if "rear" in sensors.encoder.on else car.tires.front.radius
+        time = (tick - jnp.maximum(readings.wheel_speed.tick, 0)) * dt
         speed = parts.wheel_speed(
-            sensors.encoder, radius, memory.counts - memory.counts_before, every.encoder * dt
+            sensors.encoder, radius, memory.counts - memory.counts_before, time
         )
         return readings._replace(
             counts=Reading(memory.counts, tick), wheel_speed=Reading(speed, tick)
@@ -147,17 +161,17 @@ def sense(
             battery=Reading(parts.voltmeter(sensors.voltmeter, voltage, noise), tick)
         )
 
-    counted = tick % every.encoder == 0
-    weighed = tick % every.accelerometer == 0
-    for due, report in (
-        (tick % every.sonar == 0, ping) if sensors.sonar.mounts else (None, ping),
-        (tick % every.gyroscope == 0, turn),
+    counted, weighed = due(every.encoder, tick), due(every.accelerometer, tick)
+    reports = [
+        (due(every.gyroscope, tick), turn),
         (weighed, weigh),
         (counted, count),
-        (tick % every.voltmeter == 0, probe),
-    ):
-        if due is not None:
-            readings = jax.lax.cond(due, report, lambda same: same, readings)
+        (due(every.voltmeter, tick), probe),
+    ]
+    if sensors.sonar.mounts:
+        reports.append((due(every.sonar, tick), ping))
+    for now, report in reports:
+        readings = jax.lax.cond(now, report, lambda same: same, readings)
     return memory._replace(
         readings=readings,
         counts_before=jnp.where(counted, memory.counts, memory.counts_before),

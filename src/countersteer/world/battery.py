@@ -21,3 +21,8 @@ def resistance(battery: Battery) -> Scalar:
 def capacity(battery: Battery) -> Scalar:
     """Charge that a full pack of this wear holds (C)."""
     return battery.capacity * (1 - battery.wear * battery.wear_capacity)
+
+
+def drained(battery: Battery, charge: Scalar, taken: Scalar) -> Scalar:
+    """State of charge (0 to 1) after so many coulombs more; an empty pack stays empty."""
+    return jnp.maximum(charge - taken / capacity(battery), 0.0)

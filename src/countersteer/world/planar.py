@@ -10,10 +10,15 @@ velocities v (body, wheels) to slips, M the inertias, and D >= 0 what drag and b
 and holds them over the tick, in the body's axes at its middle. What is then linear is solved by
 two implicit Euler stages of gamma h, Alexander's L-stable method of second order, and the velocity
 is rotated exactly into those axes before and out of them after. So the scheme is of second order
-where the motion is smooth; and since the held system is symmetric, a method that is stable for
-each of its modes can only take kinetic energy out while a = 0, for any step h and any k >= 0:
-contacts cannot put energy in. Wheels, differentials, rotor and back-EMF are eliminated in closed
+where the motion is smooth. Wheels, differentials, rotor and back-EMF are eliminated in closed
 form, and a 3 x 3 system is left for the body.
+
+A contact whose slip keeps its direction is followed along the tangent of its law, any other along
+its chord, which is -k times the slip at the end of the stage. Chords alone take energy out at any
+step h and any k >= 0, as the held system is then symmetric and every mode of it is damped;
+tangents do not guarantee it. So a tick that ends with more kinetic energy than it began with and
+the motor can have put in is taken again, by one implicit Euler step on chords: it gives up order,
+and contacts cannot put energy in.
 
 Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 """
@@ -68,7 +73,7 @@ def initial_state(
 
     `slots` is the length of the delay lines in ticks; by default what the car's delays need.
     """
-    dtype = np.asarray(car.body.mass).dtype
+    dtype = jnp.result_type(car.body.mass)
     zero = dtype.type(0)
     if slots is None:
         slots = delay_slots(car, dt)
@@ -80,7 +85,9 @@ def initial_state(
         )
     )
     motion = Motion(*pose, *velocity, speeds, zero, zero, zero, zero, charge)
-    motion = jax.tree.map(dtype.type, motion)
+    motion = jax.tree.map(
+        lambda leaf: leaf if isinstance(leaf, jax.Array) else dtype.type(leaf), motion
+    )
     line = np.zeros(slots, dtype)
     return State(motion, line, line, zero, zero, zero, zero)
 
@@ -174,7 +181,7 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
         vy=after.y,
         yaw_rate=after.yaw,
         wheels=wheels,
-        charge=start.charge - h * held.drive.battery_current / battery.capacity(car.battery),
+        charge=battery.drained(car.battery, start.charge, h * held.drive.battery_current),
     )
     return state._replace(motion=motion), tick
 
@@ -387,7 +394,7 @@ def judge(state: State, tick: Tick) -> tuple[State, Tick]:
     loads = chassis.wheel_loads(tick.car.body, state.motion.load_ax, state.motion.load_ay)
     up = chassis.pair_in_air(loads)
     airborne = up * (state.airborne + tick.dt)
-    over = jnp.where(airborne >= ROLL_OVER_TIME, 1.0, state.rolled_over)
+    over = jnp.where(airborne >= ROLL_OVER_TIME - tick.dt / 2, 1.0, state.rolled_over)
     return state._replace(airborne=airborne, rolled_over=over), tick
 
 

@@ -7,17 +7,19 @@ from countersteer.car.car import Body
 from countersteer.car.parameter import Scalar
 from countersteer.world.state import Motion
 
+FAR = 1e5  # m
+PREFERENCE = 1e-3  # depth that a wall gives up per distance by which it misses the corner
+
 
 def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scalar]:
     """The motion after the deepest contact with a wall, and 1 where there was one, else 0.
 
     `walls` is (n, 4), the ends of segments in metres; rows of NaN touch nothing. Rectangle and
     segment overlap unless one of three axes separates them: the rectangle's two and the segment's
-    normal. The axis of least overlap is the contact's normal; the contact is the rectangle's
-    deepest corner on the segment's normal, else the deepest end of the segment. The car is moved
-    out along the normal. Where the contact approaches, it takes the impulse that stops it
-    (with Coulomb friction), times 1 + restitution; both never add energy: the plastic impulse p
-    satisfies p · v' <= 0, so that (1 + e) p changes the energy by (1 + e)(1 - e)/2 p · v <= 0.
+    normal. The axis of least overlap is the contact's normal. On the segment's normal the contact
+    is the deepest corner of the rectangle, or the middle of what touches where a side lies flat;
+    else it is the deepest end of the segment. The car is moved out along the normal, and a contact
+    that approaches takes an impulse (`impulse`).
     """
     cosine, sine = jnp.cos(motion.heading), jnp.sin(motion.heading)
 
@@ -25,11 +27,14 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
         dx, dy = x - motion.x, y - motion.y
         return cosine * dx + sine * dy - body.center, cosine * dy - sine * dx
 
+    # Padding stands far off, where it touches nothing and every derivative is finite.
+    walls = jnp.where(jnp.isnan(walls), jnp.asarray([FAR, FAR, FAR + 1, FAR]), walls)
     ax, ay = to_body(walls[:, 0], walls[:, 1])
     bx, by = to_body(walls[:, 2], walls[:, 3])
     half_x, half_y = body.length / 2, body.width / 2
     length = jnp.sqrt((bx - ax) ** 2 + (by - ay) ** 2 + 1e-18)
-    nx, ny = (ay - by) / length, (bx - ax) / length
+    tx, ty = (bx - ax) / length, (by - ay) / length
+    nx, ny = -ty, tx
     side = jnp.where(nx * ax + ny * ay > 0, -1.0, 1.0)  # towards the rectangle's centre
     nx, ny = side * nx, side * ny
     # Overlap along the segment's normal and along the rectangle's axes (from either side).
@@ -41,10 +46,17 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     to_right = half_y + jnp.maximum(ay, by)
     on_x, on_y = jnp.minimum(ahead, behind), jnp.minimum(to_left, to_right)
     depth = jnp.minimum(jnp.minimum(on_x, on_y), on_wall)
-    depth = jnp.where(jnp.isnan(depth), -1.0, depth)
 
-    deepest = jnp.argmax(depth)
-    take = lambda values: values[deepest]  # noqa: E731  # twelve uses below
+    # Along each wall: the deepest corner, or the middle of a side that lies flat, on the wall.
+    corner_x, corner_y = -_sign(nx) * half_x, -_sign(ny) * half_y
+    middle = (corner_x - ax) * tx + (corner_y - ay) * ty
+    spread = jnp.abs(tx) * half_x * (corner_x == 0) + jnp.abs(ty) * half_y * (corner_y == 0)
+    first, last = jnp.clip(middle - spread, 0.0, length), jnp.clip(middle + spread, 0.0, length)
+    at = (first + last) / 2
+    # Of the pieces of one wall, all equally deep, the one that has the corner takes the contact.
+    missed = jnp.maximum(jnp.abs(at - middle) - spread, 0.0)
+    deepest = jnp.argmax(depth - jnp.where(depth > 0, PREFERENCE * missed, 0.0))
+    take = lambda values: values[deepest]  # noqa: E731  # it is used all over below
     hits = take(depth) > 0
     by_wall = take(on_wall) <= jnp.minimum(take(on_x), take(on_y))
     by_x = take(on_x) <= take(on_y)
@@ -57,11 +69,9 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
         jnp.where(from_front, take(ax) < take(bx), take(ax) > take(bx)),
         jnp.where(from_left, take(ay) < take(by), take(ay) > take(by)),
     )
-    # A corner of the rectangle, or an end of the wall; a flat side touches in its middle.
-    corner_x = -_sign(take(nx)) * half_x
-    corner_y = -_sign(take(ny)) * half_y
-    point_x = jnp.where(by_wall, corner_x, jnp.where(first_end, take(ax), take(bx))) + body.center
-    point_y = jnp.where(by_wall, corner_y, jnp.where(first_end, take(ay), take(by)))
+    point_x = jnp.where(by_wall, take(ax + at * tx), jnp.where(first_end, take(ax), take(bx)))
+    point_y = jnp.where(by_wall, take(ay + at * ty), jnp.where(first_end, take(ay), take(by)))
+    point_x = point_x + body.center
 
     speed_n = normal_x * (motion.vx - motion.yaw_rate * point_y) + normal_y * (
         motion.vy + motion.yaw_rate * point_x
@@ -74,27 +84,11 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     k_nn = 1 / body.mass + arm_n**2 / body.yaw_inertia
     k_tt = 1 / body.mass + arm_t**2 / body.yaw_inertia
     k_nt = arm_n * arm_t / body.yaw_inertia
-    determinant = k_nn * k_tt - k_nt**2
-    stick_n = (k_nt * speed_t - k_tt * speed_n) / determinant
-    stick_t = (k_nt * speed_n - k_nn * speed_t) / determinant
-    # Sliding: friction at its limit against the tangential speed, the normal speed stopped.
-    slip = -jnp.sign(speed_t) * body.wall_friction
-    along = k_nn + k_nt * slip
-    slide_n = -speed_n / jnp.where(along > 0, along, k_nn)
-    sticks = (jnp.abs(stick_t) <= body.wall_friction * stick_n) & (stick_n >= 0)
-    slides = along > 0
-    impulse_n = jnp.where(sticks, stick_n, jnp.where(slides, slide_n, -speed_n / k_nn))
-    impulse_t = jnp.where(sticks, stick_t, jnp.where(slides, slip * slide_n, 0.0))
-    # Friction that would turn the slip around in one impulse has stopped it on the way.
-    after_t = speed_t + k_nt * impulse_n + k_tt * impulse_t
-    turns = ~sticks & (after_t * speed_t < 0)
-    impulse_t = jnp.where(turns, jnp.where(stick_n >= 0, stick_t, 0.0), impulse_t)
-    impulse_n = jnp.where(turns, jnp.where(stick_n >= 0, stick_n, -speed_n / k_nn), impulse_n)
-    push = jnp.where(hits & (speed_n < 0), 1 + body.wall_restitution, 0.0)
-    impulse_n, impulse_t = push * impulse_n, push * impulse_t
+    meets = hits & (speed_n < 0)
+    impulse_n, impulse_t = impulse(jnp.where(meets, speed_n, -1.0), speed_t, k_nn, k_tt, k_nt, body)
+    impulse_n, impulse_t = jnp.where(meets, impulse_n, 0.0), jnp.where(meets, impulse_t, 0.0)
 
     out = jnp.where(hits, take(depth), 0.0)
-    out = jnp.where(jnp.isnan(out), 0.0, out)
     out_x, out_y = out * normal_x, out * normal_y
     force_x = normal_x * impulse_n - normal_y * impulse_t
     force_y = normal_y * impulse_n + normal_x * impulse_t
@@ -107,6 +101,36 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     )
     touched = jax.tree.map(lambda a, b: jnp.where(hits, a, b), moved, motion)
     return touched, jnp.where(hits, 1.0, 0.0)
+
+
+def impulse(
+    speed_n: Scalar, speed_t: Scalar, k_nn: Scalar, k_tt: Scalar, k_nt: Scalar, body: Body
+) -> tuple[Scalar, Scalar]:
+    """The impulse (N s) along the normal and the tangent at a contact that approaches.
+
+    Speeds of the contact before it in m/s (speed_n < 0), k the inverse masses there (1/kg). First
+    the plastic impulse (n, t), after which the contact has no normal speed: it sticks where that
+    takes |t| <= mu n; else t = -mu s n, s the sign of the slip that is left. So t takes energy out.
+    Then the wall gives back e n along the normal, e the restitution, or less where the energy
+    would rise: with what n and t took out, E, e n <= sqrt(2 E / k_nn).
+    """
+    mu = body.wall_friction
+    determinant = k_nn * k_tt - k_nt**2
+    stick_n = (k_nt * speed_t - k_tt * speed_n) / determinant
+    stick_t = (k_nt * speed_n - k_nn * speed_t) / determinant
+    n, t = -speed_n / k_nn, 0.0 * speed_t  # should neither direction of sliding last
+    onward = jnp.where(speed_t == 0, jnp.sign(k_nt), jnp.sign(speed_t))
+    for s in (-onward, onward):
+        give = k_nn - mu * s * k_nt
+        slides_n = -speed_n / jnp.where(give > 0, give, k_nn)
+        left = speed_t + (k_nt - mu * s * k_tt) * slides_n
+        lasts = (give > 0) & (left * s >= 0)
+        n, t = jnp.where(lasts, slides_n, n), jnp.where(lasts, -mu * s * slides_n, t)
+    sticks = (stick_n > 0) & (jnp.abs(stick_t) <= mu * stick_n)
+    n, t = jnp.where(sticks, stick_n, n), jnp.where(sticks, stick_t, t)
+    change = n * speed_n + t * speed_t + (k_nn * n**2 + 2 * k_nt * n * t + k_tt * t**2) / 2
+    bound = jnp.sqrt(jnp.maximum(-2 * change / k_nn, 1e-30))
+    return n + jnp.minimum(body.wall_restitution * n, bound), t
 
 
 def _sign(component: jax.Array) -> jax.Array:
