@@ -1,0 +1,177 @@
+"""Tables in files: CSV columns as arrays, read strictly and written so that they round-trip."""
+
+import csv
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from countersteer.errors import InputError
+
+COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
+TRUTH = (
+    "time_s",
+    "x_m",
+    "y_m",
+    "heading_rad",
+    "vx_mps",
+    "vy_mps",
+    "yaw_rate_radps",
+    "wheel_fl_radps",
+    "wheel_fr_radps",
+    "wheel_rl_radps",
+    "wheel_rr_radps",
+    "steering_rad",
+    "battery_v",
+)
+LARGEST_STEERING = 90.0  # degrees
+
+
+class Table(dict[str, np.ndarray]):
+    """Columns by name, all of one length; `time_s` rises."""
+
+    def __len__(self) -> int:
+        """Rows."""
+        return len(next(iter(self.values()))) if self.keys() else 0
+
+
+def read_table(path: Path, required: Iterable[str], text: Sequence[str] = ()) -> Table:
+    """A CSV file with a header as columns of numbers; empty cells are NaN.
+
+    Columns named in `text` stay as they are. The table ends before a last line that was cut off
+    in the middle (a process that was killed). Raises `InputError` with the line where the file is
+    not what it should be: no header, missing columns, no number, a time that goes backwards.
+    """
+    try:
+        content = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise InputError(f"{path}: cannot be read: {reason}") from None
+    lines = content.splitlines()
+    if lines and not content.endswith("\n"):
+        lines = lines[:-1] if len(lines) > 1 and lines[-1].count(",") < lines[0].count(",") else lines
+    rows = csv.reader(lines)
+    header = next(rows, [])
+    missing = [name for name in required if name not in header]
+    if missing:
+        raise InputError(f"{path}: column {missing[0]} is missing")
+    if len(set(header)) != len(header):
+        raise InputError(f"{path}: a column is there twice")
+    columns: list[list[float]] = [[] for _ in header]
+    words: list[list[str]] = [[] for _ in header]
+    for number, row in enumerate(rows, start=2):
+        if len(row) != len(header):
+            raise InputError(f"{path}, line {number}: {len(row)} cells, not {len(header)}")
+        for i, (name, cell) in enumerate(zip(header, row, strict=True)):
+            if name in text:
+                words[i].append(cell)
+                continue
+            try:
+                columns[i].append(float(cell) if cell else math.nan)
+            except ValueError:
+                raise InputError(
+                    f"{path}, line {number}: {name} must be a number, not {cell!r}"
+                ) from None
+    table = Table(
+        {
+            name: np.array(words[i] if name in text else columns[i])
+            for i, name in enumerate(header)
+        }
+    )
+    if "time_s" in table:
+        time = table["time_s"]
+        if not np.all(np.isfinite(time)):
+            raise InputError(f"{path}, line {_first(~np.isfinite(time))}: time_s is not a number")
+        if np.any(np.diff(time) < 0):
+            line = _first(np.diff(time) < 0) + 1
+            raise InputError(f"{path}, line {line}: time_s goes backwards")
+    return table
+
+
+def _first(where: np.ndarray) -> int:
+    """Line of the file that holds the first row for which this is true."""
+    return int(np.argmax(where)) + 2
+
+
+def read_commands(path: Path) -> Table:
+    """A `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad)."""
+    table = read_table(path, COMMANDS, text=("direction",))
+    for name in table:
+        if name not in COMMANDS:
+            raise InputError(f"{path}: unknown column {name}; known: {', '.join(COMMANDS)}")
+    if not len(table):
+        raise InputError(f"{path}: holds no command")
+    throttle, steering = table["throttle"], table["steering_deg"]
+    for wrong, message in (
+        (~np.isin(table["direction"], ("forward", "reverse")), "direction must be forward or reverse"),
+        (~((throttle >= 0) & (throttle <= 1)), "throttle must be in [0, 1]"),
+        (
+            ~(np.abs(steering) <= LARGEST_STEERING),
+            f"steering_deg must be in [-{LARGEST_STEERING:g}, {LARGEST_STEERING:g}]",
+        ),
+        (table["time_s"] < 0, "time_s must not be negative"),
+    ):
+        if np.any(wrong):
+            raise InputError(f"{path}, line {_first(wrong)}: {message}")
+    sign = np.where(table["direction"] == "reverse", -1.0, 1.0)
+    return Table(
+        time_s=table["time_s"], throttle=sign * throttle, steering=np.radians(steering)
+    )
+
+
+def command_rows(time: np.ndarray, throttle: np.ndarray, steering: np.ndarray) -> list[list[str]]:
+    """Rows of a `commands.csv`; throttle is negative in reverse, steering in rad."""
+    degrees = np.degrees(steering)
+    return [
+        [_cell(t), _cell(abs(u)), "reverse" if u < 0 else "forward", _cell(d)]
+        for t, u, d in zip(time.tolist(), throttle.tolist(), degrees.tolist(), strict=True)
+    ]
+
+
+def column_rows(columns: Iterable[np.ndarray]) -> list[list[str]]:
+    """Rows of numbers; NaN is an empty cell, infinity is `inf`."""
+    return [[_cell(v) for v in row] for row in zip(*(c.tolist() for c in columns), strict=True)]
+
+
+def _cell(value: float) -> str:
+    """The shortest text that reads back as the same number."""
+    if value != value:
+        return ""
+    return repr(int(value)) if value == int_of(value) else repr(value)
+
+
+def int_of(value: float) -> float:
+    """The nearest whole number, or NaN for one that has too many digits to be one."""
+    return round(value) if abs(value) < 1e15 else math.nan
+
+
+class TableWriter:
+    """Writes a CSV file piece by piece; what was flushed stays readable whatever comes."""
+
+    def __init__(self, path: Path, header: Sequence[str]) -> None:
+        """Opens the file anew and writes its header."""
+        self._path = path
+        self._file: TextIO = path.open("w", newline="")
+        self._file.write(",".join(header) + "\n")
+        self._file.flush()
+
+    def write(self, rows: Iterable[Sequence[str]]) -> None:
+        """Appends rows and hands them to the operating system."""
+        try:
+            self._file.write("".join(",".join(row) + "\n" for row in rows))
+            self._file.flush()
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from None
+
+    def close(self) -> None:
+        """Ends the file."""
+        self._file.close()
+
+
+def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """A whole table at once."""
+    writer = TableWriter(path, list(columns))
+    writer.write(column_rows(columns.values()))
+    writer.close()

@@ -1,0 +1,56 @@
+"""`Run`: the record of one drive, read from its folder."""
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.car.files import car_from_tables
+from countersteer.errors import InputError
+from countersteer.runs.files import Table, read_commands, read_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A drive of a simulated or a real car. Tables that are not there are None."""
+
+    path: Path
+    about: dict[str, Any]  # run.toml
+    commands: Table  # time_s, throttle (negative in reverse), steering (rad)
+    telemetry: Table | None
+    truth: Table | None
+
+    @property
+    def car(self) -> Car | None:
+        """The car that drove, where it was simulated."""
+        tables = self.about.get("car")
+        return car_from_tables(tables, f"{self.path}/run.toml") if isinstance(tables, dict) else None
+
+    @property
+    def walls(self) -> np.ndarray:
+        """(n, 4) ends of the course's walls, m."""
+        walls = self.about.get("course", {}).get("walls_m", [])
+        return np.array(walls, float).reshape(-1, 4)
+
+
+def read_run(path: Path) -> Run:
+    """A run's folder. Raises `InputError` where it is not one."""
+    if not path.is_dir():
+        raise InputError(f"{path}: no such run folder")
+    try:
+        about = tomllib.loads((path / "run.toml").read_text())
+    except FileNotFoundError:
+        raise InputError(f"{path}: not a run: it has no run.toml") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}/run.toml: cannot be read: {error}") from None
+    telemetry, truth = path / "telemetry.csv", path / "truth.csv"
+    return Run(
+        path,
+        about,
+        read_commands(path / "commands.csv"),
+        read_table(telemetry, ("time_s",)) if telemetry.exists() else None,
+        read_table(truth, ("time_s", "x_m", "y_m", "heading_rad")) if truth.exists() else None,
+    )

@@ -1,0 +1,78 @@
+"""Writes a run's folder while the drive goes on."""
+
+import itertools
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomli_w
+
+from countersteer.errors import InputError
+from countersteer.runs.files import COMMANDS, TRUTH, TableWriter, column_rows, command_rows
+
+WHEELS = ("fl", "fr", "rl", "rr")
+
+
+class Rows(NamedTuple):
+    """What a piece of a drive adds: columns by file, SI units and radians."""
+
+    commands: tuple[np.ndarray, np.ndarray, np.ndarray]  # time, throttle, steering
+    telemetry: tuple[np.ndarray, ...]  # in the order of the header given; NaN: nothing new
+    truth: tuple[np.ndarray, ...]  # in the order of `TRUTH`
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """An empty folder for a run. Without `out`, a numbered one under `runs/`.
+
+    A run that is there already is kept: it is moved aside to a name with the next free number.
+    Raises `InputError` where the folder holds something that is no run.
+    """
+    if out is None:
+        numbered = (Path("runs") / f"{name}-{number:03d}" for number in itertools.count(1))
+        out = next(path for path in numbered if not path.exists())
+    try:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            if not (out / "run.toml").exists():
+                raise InputError(f"{out}: is there already and is not a run: give another --out")
+            others = (out.with_name(f"{out.name}.{number}") for number in itertools.count(1))
+            out.rename(next(path for path in others if not path.exists()))
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made: {error.strerror}") from None
+    return out
+
+
+class RunWriter:
+    """A folder with `run.toml` and three tables that grow; flushed with every piece."""
+
+    def __init__(self, folder: Path, about: dict[str, Any], telemetry: tuple[str, ...]) -> None:
+        """Writes `run.toml` and the headers."""
+        self.folder = folder
+        (folder / "run.toml").write_text(tomli_w.dumps(about))
+        self._commands = TableWriter(folder / "commands.csv", COMMANDS)
+        self._telemetry = TableWriter(folder / "telemetry.csv", telemetry)
+        self._truth = TableWriter(folder / "truth.csv", TRUTH)
+
+    def write(self, rows: Rows) -> None:
+        """Appends a piece."""
+        self._commands.write(command_rows(*rows.commands))
+        self._telemetry.write(column_rows(rows.telemetry))
+        self._truth.write(column_rows(rows.truth))
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Writes `summary.json`."""
+        (self.folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+
+    def __enter__(self) -> "RunWriter":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for table in (self._commands, self._telemetry, self._truth):
+            table.close()
