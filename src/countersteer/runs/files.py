@@ -51,7 +51,9 @@ def read_table(path: Path, required: Iterable[str], text: Sequence[str] = ()) ->
         raise InputError(f"{path}: cannot be read: {reason}") from None
     lines = content.splitlines()
     if lines and not content.endswith("\n"):
-        lines = lines[:-1] if len(lines) > 1 and lines[-1].count(",") < lines[0].count(",") else lines
+        lines = (
+            lines[:-1] if len(lines) > 1 and lines[-1].count(",") < lines[0].count(",") else lines
+        )
     rows = csv.reader(lines)
     header = next(rows, [])
     missing = [name for name in required if name not in header]
@@ -75,10 +77,7 @@ def read_table(path: Path, required: Iterable[str], text: Sequence[str] = ()) ->
                     f"{path}, line {number}: {name} must be a number, not {cell!r}"
                 ) from None
     table = Table(
-        {
-            name: np.array(words[i] if name in text else columns[i])
-            for i, name in enumerate(header)
-        }
+        {name: np.array(words[i] if name in text else columns[i]) for i, name in enumerate(header)}
     )
     if "time_s" in table:
         time = table["time_s"]
@@ -105,7 +104,10 @@ def read_commands(path: Path) -> Table:
         raise InputError(f"{path}: holds no command")
     throttle, steering = table["throttle"], table["steering_deg"]
     for wrong, message in (
-        (~np.isin(table["direction"], ("forward", "reverse")), "direction must be forward or reverse"),
+        (
+            ~np.isin(table["direction"], ("forward", "reverse")),
+            "direction must be forward or reverse",
+        ),
         (~((throttle >= 0) & (throttle <= 1)), "throttle must be in [0, 1]"),
         (
             ~(np.abs(steering) <= LARGEST_STEERING),
@@ -116,9 +118,7 @@ def read_commands(path: Path) -> Table:
         if np.any(wrong):
             raise InputError(f"{path}, line {_first(wrong)}: {message}")
     sign = np.where(table["direction"] == "reverse", -1.0, 1.0)
-    return Table(
-        time_s=table["time_s"], throttle=sign * throttle, steering=np.radians(steering)
-    )
+    return Table(time_s=table["time_s"], throttle=sign * throttle, steering=np.radians(steering))
 
 
 def command_rows(time: np.ndarray, throttle: np.ndarray, steering: np.ndarray) -> list[list[str]]:

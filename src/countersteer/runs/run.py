@@ -27,7 +27,9 @@ class Run:
     def car(self) -> Car | None:
         """The car that drove, where it was simulated."""
         tables = self.about.get("car")
-        return car_from_tables(tables, f"{self.path}/run.toml") if isinstance(tables, dict) else None
+        return (
+            car_from_tables(tables, f"{self.path}/run.toml") if isinstance(tables, dict) else None
+        )
 
     @property
     def walls(self) -> np.ndarray:
