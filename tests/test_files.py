@@ -306,3 +306,23 @@ def test_help_comes_without_loading_the_physics():
         check=True,
     )
     assert done.stdout.strip().endswith("[]")
+
+
+def test_rounded_corners_join_their_straights_on_one_circle(tmp_path):
+    path = tmp_path / "round.toml"
+    path.write_text(
+        "width_m = 1.2\nclosed = true\nsegments = ["
+        + "{straight_m = 4.0}, {turn_deg = -90.0, radius_m = 1.0}," * 4
+        + "]"
+    )
+    course = load_course(str(path))
+    assert course.length == pytest.approx(4 * (2 + math.pi / 2), rel=1e-3)
+    assert [t.distance for t in course.turns] == pytest.approx(
+        [2 + math.pi / 4 + i * (2 + math.pi / 2) for i in range(4)]
+    )
+    centres = np.array([[1, -1], [3, -1], [3, -3], [1, -3]])
+    for side, radius in ((1.2 / 2, 1.6), (-1.2 / 2, 0.4)):
+        half = len(course.walls) // 2
+        ends = course.walls[:half, :2] if side > 0 else course.walls[half:, :2]
+        away = np.hypot(*(ends[:, None] - centres[None]).transpose(2, 0, 1)).min(axis=1)
+        np.testing.assert_allclose(away, radius, rtol=5e-3)  # chords of 5°, mitred

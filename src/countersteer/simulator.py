@@ -321,8 +321,12 @@ def keep_programs() -> None:
     To be called before JAX computes anything; the command line does. A library does not do this
     behind its user's back. Without it all works, but starts and runs at half the speed or less.
     """
-    # Without it, scalars that several results need are computed anew for each of them.
-    fusion = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
+    # Without the first, scalars that several results need are computed anew for each of them; with
+    # it, the newer emitters abort the process on some batched programs.
+    fusion = (
+        "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion "
+        "--xla_cpu_use_fusion_emitters=false"
+    )
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {fusion}".strip()

@@ -124,50 +124,44 @@ def from_walls(
 def _rounded(
     name: str, corners: np.ndarray, angles: list[float], radii: list[float], closed: bool
 ) -> tuple[np.ndarray, tuple[Turn, ...]]:
-    """Corner points with arcs put in, and the turns with their distances."""
-    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    """Corner points with arcs put in, and the turns with their distances.
+
+    A closed line starts and ends where the arc of its last turn, that of corner 0, ends.
+    """
+    steps = np.diff(corners, axis=0)
+    lengths, headings = np.hypot(*steps.T), np.arctan2(steps[:, 1], steps[:, 0])
     trims = [r * math.tan(abs(a) / 2) for a, r in zip(angles, radii, strict=True)]
     after = [*trims[1:], trims[0] if closed else 0.0]
     if np.any(lengths < np.array(trims) + np.array(after) - 1e-9):
         raise InputError(f"{name}: a radius_m is too large for the straights beside it")
-    points: list[np.ndarray] = []
-    turns = []
-    walked = 0.0
-    headings = np.arctan2(*np.diff(corners, axis=0).T[::-1])
-    for i, (angle, radius, trim) in enumerate(zip(angles, radii, trims, strict=True)):
-        if i:
-            walked += lengths[i - 1] - trims[i - 1] - trim
-        arc = abs(angle) * radius
-        if angle and (i or not closed):
-            turns.append(Turn(walked + arc / 2, angle))
-        if radius > 0 and angle:
-            into = headings[i] - angle
-            entry = corners[i] - trim * np.array([math.cos(into), math.sin(into)])
-            steps = max(1, math.ceil(abs(angle) / ARC_STEP))
-            chord = 2 * radius * math.sin(abs(angle) / steps / 2)
-            arc_points = [entry]
-            for k in range(steps):
-                bearing = into + angle * (k + 0.5) / steps
-                arc_points.append(
-                    arc_points[-1] + chord * np.array([math.cos(bearing), math.sin(bearing)])
-                )
-            # A closed course starts and ends in the middle of its last turn's arc, at its exit.
-            points.extend(arc_points[-1:] if i == 0 else arc_points)
-            first_arc = arc_points if i == 0 else None
-            if first_arc is not None:
-                closing = first_arc
-        else:
-            points.append(corners[i])
-            if i == 0:
-                closing = [corners[0]]
-        walked += arc if i else 0.0
-    if closed:
-        points.extend(closing)
-        walked += lengths[-1] - trims[-1] - trims[0]
-        turns.append(Turn(walked + abs(angles[0]) * radii[0] / 2, angles[0]))
-    else:
-        points.append(corners[-1])
-    return np.array(points), tuple(turns)
+    arcs = [
+        _arc(corners[i], float(headings[i]) - angles[i], angles[i], radii[i])
+        for i in range(len(angles))
+    ]
+    last = arcs[0] if closed else corners[-1:]
+    points = np.concatenate([arcs[0][-1:], *arcs[1:], last])
+    turns, walked = [], 0.0
+    order = [*range(1, len(angles)), 0] if closed else range(1, len(angles))
+    for i in order:
+        walked += float(lengths[i - 1]) - trims[i - 1] - trims[i]
+        bend = abs(angles[i]) * radii[i]
+        if angles[i]:
+            turns.append(Turn(walked + bend / 2, angles[i]))
+        walked += bend
+    return points, tuple(turns)
+
+
+def _arc(corner: np.ndarray, heading: float, angle: float, radius: float) -> np.ndarray:
+    """Points on the arc that rounds a corner entered at this heading; the corner if it has none."""
+    if radius == 0 or angle == 0:
+        return corner[None]
+    count = max(1, math.ceil(abs(angle) / ARC_STEP))
+    bearings = heading + angle * (np.arange(count) + 0.5) / count
+    chord = 2 * radius * math.sin(abs(angle) / count / 2)
+    steps = chord * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    ahead = np.array([math.cos(heading), math.sin(heading)])
+    entry = corner - radius * math.tan(abs(angle) / 2) * ahead
+    return np.vstack([entry, entry + np.cumsum(steps, axis=0)])
 
 
 def _offset(points: np.ndarray, closed: bool, aside: float) -> np.ndarray:

@@ -28,7 +28,7 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
         return cosine * dx + sine * dy - body.center, cosine * dy - sine * dx
 
     # Padding stands far off, where it touches nothing and every derivative is finite.
-    walls = jnp.where(jnp.isnan(walls), jnp.asarray([FAR, FAR, FAR + 1, FAR]), walls)
+    walls = jnp.where(jnp.isnan(walls), jnp.asarray([FAR, FAR, FAR + 1, FAR], walls.dtype), walls)
     ax, ay = to_body(walls[:, 0], walls[:, 1])
     bx, by = to_body(walls[:, 2], walls[:, 3])
     half_x, half_y = body.length / 2, body.width / 2
