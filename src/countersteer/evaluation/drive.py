@@ -4,7 +4,9 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import math
+import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -221,6 +223,33 @@ def telemetry_header(simulator: Simulator) -> tuple[str, ...]:
     )
 
 
+class Interrupt:
+    """Notes a Ctrl-C once a drive is under way, so that it ends between two pieces.
+
+    An exception could come anywhere, also where some library swallows it. Before the first piece,
+    and from the second Ctrl-C on, it is raised as ever.
+    """
+
+    def __init__(self) -> None:
+        """Nothing was asked yet."""
+        self.under_way = self.asked = False
+
+    def __enter__(self) -> "Interrupt":
+        self._before = None
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _note(self, *_: object) -> None:
+        if self.asked or not self.under_way:
+            raise KeyboardInterrupt
+        self.asked = True
+
+
 def drive(
     simulator: Simulator,
     folder: Path,
@@ -238,23 +267,19 @@ def drive(
     logs: list[Log] = []
     status = "out of time"
     with RunWriter(folder, about, telemetry_header(simulator)) as writer:
-        with contextlib.closing(simulator.run(longest)) as pieces:
-            try:
-                for record in pieces:
-                    log, end = Log.read(record, simulator, judge, longest)
-                    logs.append(log)
-                    writer.write(log.rows)
-                    if judge.goal is not None:
-                        report(judge.distance, judge.goal)
-                    else:
-                        report(float(log.truth["time_s"][-1]), longest)
-                    if end is not None:
-                        status = end
-                        break
-            except KeyboardInterrupt:
-                if not logs:
-                    raise
-                status = "interrupted"
+        with Interrupt() as interrupt, contextlib.closing(simulator.run(longest)) as pieces:
+            for record in pieces:
+                log, end = Log.read(record, simulator, judge, longest)
+                logs.append(log)
+                writer.write(log.rows)
+                interrupt.under_way = True
+                if judge.goal is not None:
+                    report(judge.distance, judge.goal)
+                else:
+                    report(float(log.truth["time_s"][-1]), longest)
+                if interrupt.asked or end is not None:
+                    status = end or "interrupted"
+                    break
         contacts = int(logs[-1].truth["wall_contacts"][-1]) if logs else 0
         if judge.goal is None and status == "out of time":
             status = "done"
