@@ -50,8 +50,10 @@ def test_every_corner_is_drifted_and_no_wall_touched(course, seed, tmp_path, cap
 
 
 def test_what_was_driven_can_be_replayed_to_the_same_motion(box, tmp_path, capsys):
-    status, _ = drive(capsys, "replay", box, "--out", tmp_path / "again")
+    status, result = drive(capsys, "replay", box, "--out", tmp_path / "again")
     assert status == 0
+    assert result["completed"]
+    assert len(read_run(tmp_path / "again").walls) == 8
     first, again = read_run(box).truth, read_run(tmp_path / "again").truth
     rows = min(len(first), len(again))
     assert abs(len(first) - len(again)) <= 2

@@ -89,6 +89,7 @@ def test_a_wrong_car_is_refused_in_one_line(text, says, tmp_path):
         ("width_m = 1\nclosed = true\nsegments = [{straight_m = 1.0}]", "do not come back"),
         ("walls_m = [[[0, 0]]]", "walls_m[0] must hold two or more points"),
         ("width_m = 1\nsegments = [{straight_m = 1}]\n[start]\ndistance_m = 2", "start.distance_m"),
+        ("width_m = 1\nsegments = [{straight_m = 1}]\n[start]\noffset_m = 2", "start.offset_m"),
     ],
 )
 def test_a_wrong_course_is_refused_in_one_line(text, says, tmp_path):
@@ -134,6 +135,7 @@ def test_wrong_commands_are_refused_in_one_line(rows, says, tmp_path):
         ["drive", "box", "--set", "battery.wear=2"],
         ["drive", "box", "--set", "battery.wear=nan"],
         ["drive", "box", "--set", "wear"],
+        ["drive", "box", "--set", "wear=1"],
         ["drive", "box", "--battery", "1.5"],
         ["drive", "box", "--battery", "nan"],
         ["drive", "box", "--speed-mps", "fast"],

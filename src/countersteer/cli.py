@@ -1,11 +1,11 @@
 """The command line: parse, call, print."""
 
 import argparse
-import importlib
 import json
 import math
+import os
+import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 DRIVERS = ("drift-turn", "straighten")
-LIBRARIES = {"cars": "car", "courses": "course"}
+LONGEST_REPLAY = 3600.0  # s
 
 
 class Parser(argparse.ArgumentParser):
@@ -174,6 +174,7 @@ def run_drive(options: argparse.Namespace) -> int:
 def run_replay(options: argparse.Namespace) -> int:
     """`replay`."""
     from countersteer.car.files import load_car
+    from countersteer.course.files import course_of_run
     from countersteer.drivers.replay import Replay
     from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
@@ -190,7 +191,7 @@ def run_replay(options: argparse.Namespace) -> int:
     if options.compare:
         if run is None:
             raise InputError("--compare needs a run folder, such as import makes")
-        return run_compare(options, run, car)
+        return run_compare(options, run, car, name)
     commands = run.commands if run else read_commands(options.source)
     pose, velocity = read_initial(options.initial)
     if run is not None and not options.initial:
@@ -207,8 +208,9 @@ def run_replay(options: argparse.Namespace) -> int:
     driver = Replay(
         times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
     )
+    course = course_of_run(run.about) if run else None
     simulator = Simulator(
-        None,
+        course,
         car,
         driver,
         dt=options.dt,
@@ -218,10 +220,11 @@ def run_replay(options: argparse.Namespace) -> int:
         charge=charge,
     )
     times = commands["time_s"]
+    if times[-1] > LONGEST_REPLAY:
+        raise InputError(f"{options.source}: commands go on to {times[-1]:g} s, over an hour")
     last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
-    return record(
-        options, simulator, "replay", options.source.stem, float(times[-1]) + last, 1, name
-    )
+    longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
+    return record(options, simulator, "replay", options.source.stem, longest, laps, name)
 
 
 def record(
@@ -237,28 +240,28 @@ def record(
     from countersteer.evaluation.drive import about_run, drive
     from countersteer.runs.writer import new_folder
     from countersteer.simulator import keep_programs
-    from countersteer.viewing.picture import draw_picture
+    from countersteer.viewing.picture import Painter
     from countersteer.viewing.report import report_html
 
-    keep_programs()
-    # Matplotlib is imported while the program is compiled or loaded.
-    threading.Thread(target=importlib.import_module, args=("matplotlib.figure",)).start()
+    keep_programs(batches=False)
     about = about_run(simulator, driver, car_name or options.car, laps)
     folder = new_folder(options.out, f"{Path(place).stem}-{driver}")
+    painter = Painter(folder / "report.png")
     with Progress(options.json) as progress:
         result, view = drive(simulator, folder, about, laps, longest, progress.show)
     (folder / "report.html").write_text(report_html(view))
-    draw_picture(view, folder / "report.png")
+    painter.draw(view)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
     else:
         print_result(result, folder)
     if result["status"] == "interrupted":
+        print("countersteer: interrupted", file=sys.stderr)
         return INTERRUPTED
-    return DONE if result["success"] or result["status"] == "done" else FAILED
+    return DONE if result["success"] else FAILED
 
 
-def run_compare(options: argparse.Namespace, run: Any, car: "Car") -> int:
+def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:
     """`replay --compare`."""
     from countersteer.evaluation.compare import compare, draw_comparison
     from countersteer.simulator import keep_programs
@@ -273,12 +276,10 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car") -> int:
     if options.json:
         print(json.dumps(result))
         return DONE
-    print(
-        f"{result['windows']} windows of {result['horizon_s']:g} s; error at the end of a window:"
-    )
-    for name, error in result["median_abs_error"].items():
-        nothing = result["persistence"]["median_abs_error"][name]
-        print(f"  {name:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")
+    print(f"{name}: {result['windows']} windows of {result['horizon_s']:g} s; error at their ends:")
+    for quantity, error in result["median_abs_error"].items():
+        nothing = result["persistence"]["median_abs_error"][quantity]
+        print(f"  {quantity:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")
     print(f"picture: {out / 'compare.png'}")
     return DONE
 
@@ -352,8 +353,8 @@ def read_initial(text: str) -> tuple[tuple[float, float, float], tuple[float, fl
             values[name] = float(value)
         except ValueError:
             raise InputError(f"--initial: {name} must be a number, not {value!r}") from None
-        if not math.isfinite(values[name]):
-            raise InputError(f"--initial: {name} must be finite")
+        if not abs(values[name]) <= 1000:
+            raise InputError(f"--initial: {name} must be in [-1000, 1000]")
     x, y, heading, vx, vy, yaw_rate = values.values()
     return (x, y, heading), (vx, vy, yaw_rate)
 
@@ -396,7 +397,8 @@ class Progress:
 def print_result(result: dict[str, Any], folder: Path) -> None:
     """The summary for a person."""
     lap = f" in {result['lap_time_s']:.2f} s" if result["lap_time_s"] else ""
-    print(f"{result['status']}{lap}, {result['wall_contacts']} wall contacts")
+    touched = result["wall_contacts"]
+    print(f"{result['status']}{lap}, {touched} wall contact{'s' if touched != 1 else ''}")
     for i, turn in enumerate(result["turns"], start=1):
         print(
             f"  turn {i}: in at {turn['entry_speed_mps']:.2f} m/s, "
@@ -407,5 +409,20 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     print(f"report: {folder / 'report.html'}")
 
 
-if __name__ == "__main__":
+def entry() -> None:
+    """The command: `main`, but that a Ctrl-C ends the process at once.
+
+    Until a drive is under way there is nothing to save, and an exception might come where a
+    compiler's callback swallows it.
+    """
+
+    def leave(*_: object) -> None:
+        os.write(2, b"countersteer: interrupted\n")
+        os._exit(INTERRUPTED)
+
+    signal.signal(signal.SIGINT, leave)
     sys.exit(main())
+
+
+if __name__ == "__main__":
+    entry()

@@ -52,7 +52,7 @@ def load_car(name: str, overrides: Iterable[str] = ()) -> Car:
     car = _load(name, ())
     for override in overrides:
         path, sign, text = override.partition("=")
-        if not sign or "." not in path:
+        if not sign or not path:
             raise InputError(f"--set {override}: write PATH=VALUE, such as battery.wear=0.5")
         try:
             value: Any = float(text)

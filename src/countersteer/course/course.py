@@ -109,6 +109,8 @@ def from_segments(
         raise InputError(f"{name}: goal.distance_m must lie beyond start.distance_m")
     if not closed and goal > length + 1e-9:
         raise InputError(f"{name}: goal.distance_m must be at most {length:g}")
+    if not abs(start[1]) < width / 2:
+        raise InputError(f"{name}: start.offset_m must be within the corridor")
     x, y, along = place(course, start[0])
     x, y = x - math.sin(along) * start[1], y + math.cos(along) * start[1]
     return dataclasses.replace(course, start=(x, y, along + start[2]), goal_distance=goal)

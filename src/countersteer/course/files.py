@@ -9,7 +9,7 @@ import numpy as np
 
 from countersteer.car.files import read_toml
 from countersteer.car.parameter import unknown_key
-from countersteer.course.course import Course, from_segments, from_walls
+from countersteer.course.course import Course, Turn, from_segments, from_walls
 from countersteer.errors import InputError
 
 LIBRARY = importlib.resources.files("countersteer.course") / "library"
@@ -125,3 +125,27 @@ def course_tables(course: Course) -> dict[str, Any]:
     if course.goal_distance is not None:
         tables["goal_distance_m"] = course.goal_distance
     return tables
+
+
+def course_of_run(about: dict[str, Any]) -> Course | None:
+    """The course that a `run.toml` holds, as `course_tables` wrote it; None without one."""
+    tables = about.get("course")
+    if not isinstance(tables, dict) or not isinstance(tables.get("walls_m"), list):
+        return None
+    try:
+        start = tables["start"]
+        return Course(
+            name=str(tables["name"]),
+            width=tables.get("width_m"),
+            closed=bool(tables["closed"]),
+            line=np.array(tables["line_m"], float).reshape(-1, 2),
+            walls=np.array(tables["walls_m"], float).reshape(-1, 4),
+            turns=tuple(
+                Turn(float(t["distance_m"]), math.radians(t["turn_deg"])) for t in tables["turns"]
+            ),
+            start=(float(start["x_m"]), float(start["y_m"]), float(start["heading_rad"])),
+            start_distance=float(tables["start_distance_m"]),
+            goal_distance=tables.get("goal_distance_m"),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"run.toml: [course] is not as it was written: {error}") from None

@@ -227,26 +227,30 @@ class Interrupt:
     """Notes a Ctrl-C once a drive is under way, so that it ends between two pieces.
 
     An exception could come anywhere, also where some library swallows it. Before the first piece,
-    and from the second Ctrl-C on, it is raised as ever.
+    and from the second Ctrl-C on, it does what it did before.
     """
 
     def __init__(self) -> None:
         """Nothing was asked yet."""
-        self.under_way = self.asked = False
+        self.asked = False
+        self._before: Any = None
 
     def __enter__(self) -> "Interrupt":
-        self._before = None
-        if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._note)
         return self
+
+    def begin(self) -> None:
+        """Notes Ctrl-C from now on (in the main thread; no other gets any)."""
+        if self._before is None and threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._note)
 
     def __exit__(self, *_: object) -> None:
         if self._before is not None:
             signal.signal(signal.SIGINT, self._before)
 
     def _note(self, *_: object) -> None:
-        if self.asked or not self.under_way:
-            raise KeyboardInterrupt
+        if self.asked:
+            signal.signal(signal.SIGINT, self._before)
+            signal.raise_signal(signal.SIGINT)
         self.asked = True
 
 
@@ -272,7 +276,7 @@ def drive(
                 log, end = Log.read(record, simulator, judge, longest)
                 logs.append(log)
                 writer.write(log.rows)
-                interrupt.under_way = True
+                interrupt.begin()
                 if judge.goal is not None:
                     report(judge.distance, judge.goal)
                 else:

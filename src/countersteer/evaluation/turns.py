@@ -149,12 +149,12 @@ def summary(
         if judge.course is not None
         else []
     )
-    completed = status == "goal reached"
+    completed = status in ("goal reached", "done")
     return {
         "completed": completed,
         "success": completed and contacts == 0,
         "status": status,
         "wall_contacts": contacts,
-        "lap_time_s": judge.goal_time if completed else None,
+        "lap_time_s": judge.goal_time,
         "turns": [dataclasses.asdict(turn) for turn in turns],
     }

@@ -65,6 +65,15 @@ class Log(NamedTuple):
     repairs: dict[str, int]
 
 
+# Folders of the published logs that were driven with taped tyres on tiles.
+TAPED = {
+    "circles_tape_and_tiles",
+    "drift_tape_and_tiles",
+    "slippery_floor_racing",
+    "throttle_ramps",
+}
+
+
 def import_dart(log: Path, out: Path) -> dict[str, Any]:
     """Write a DART log as the run folder `out`/<name of the log> and say what was done.
 
@@ -89,8 +98,9 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
     repairs = found.repairs | {
         "throttle_masked": int(np.sum(~armed & (updates["throttle"] != 0))),
     }
-    about = {
+    about: dict[str, Any] = {
         "format": "dart",
+        "car_name": "jetracer-tape" if log.resolve().parent.name in TAPED else "jetracer",
         "source": log.name,
         "kind": found.kind,
         "full_lock_deg": FULL_LOCK,

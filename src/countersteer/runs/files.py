@@ -136,15 +136,8 @@ def column_rows(columns: Iterable[np.ndarray]) -> list[list[str]]:
 
 
 def _cell(value: float) -> str:
-    """The shortest text that reads back as the same number."""
-    if value != value:
-        return ""
-    return repr(int(value)) if value == int_of(value) else repr(value)
-
-
-def int_of(value: float) -> float:
-    """The nearest whole number, or NaN for one that has too many digits to be one."""
-    return round(value) if abs(value) < 1e15 else math.nan
+    """The shortest text that reads back as the same number; none for NaN."""
+    return "" if value != value else repr(value).removesuffix(".0")
 
 
 class TableWriter:

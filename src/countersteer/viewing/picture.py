@@ -1,7 +1,10 @@
 """One drive at a glance, as a picture."""
 
+import json
 import math
 import pathlib
+import subprocess
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -429,3 +432,35 @@ def _ticks(low: float, high: float, least_step: float) -> list[float]:
     step = _nice_step(least_step)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [step * k for k in range(first, last + 1)]
+
+
+class Painter:
+    """A process that gets ready to draw while the drive is still computed.
+
+    Importing Matplotlib takes as long as a short drive. The process ends by itself when this one
+    does, and draws nothing then.
+    """
+
+    def __init__(self, path: pathlib.Path) -> None:
+        """It will draw to `path`."""
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "countersteer.viewing.picture", str(path)],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # a Ctrl-C is for the drive alone
+        )
+
+    def draw(self, view: dict[str, Any]) -> None:
+        """`draw_picture`, over there. Raises `OSError` with its reason if it fails."""
+        _, errors = self._process.communicate(json.dumps(view))
+        if self._process.returncode:
+            raise OSError(f"the picture was not drawn: {errors.strip().splitlines()[-1]}")
+
+
+if __name__ == "__main__":
+    import matplotlib.figure  # noqa: F401  # while the view is waited for
+
+    text = sys.stdin.read()
+    if text:
+        draw_picture(json.loads(text), pathlib.Path(sys.argv[1]))
