@@ -115,6 +115,11 @@ def write_value(declared: Declaration, value: Any) -> Any:
     return value if declared.choices else float(value) / EDGE[declared.unit][1]
 
 
+def edge_unit(declared: Declaration) -> str:
+    """The unit of the number that `write_value` gives."""
+    return {"C": "A h"}.get(declared.unit, declared.unit.replace("rad", "deg"))
+
+
 def unknown_key(where: str, key: str, known: Mapping[str, Any]) -> InputError:
     """The error for a key that nothing declares, with the nearest ones that something does."""
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
