@@ -763,7 +763,7 @@ def brush(tire: Car, slip_x: float, slip_y: float, rim: float) -> tuple[float, f
 
 def force(tire: Car, load: float, slip_x: float, slip_y: float, rim: float) -> tuple:
     c = tyre.contact(tire, load, slip_x, slip_y, rim)
-    return -c.k_x * c.slip_x, -c.k_y * c.slip_y
+    return c.force_x, c.force_y
 
 
 def test_the_tyre_is_the_brush_model_bristle_by_bristle() -> None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from countersteer.car.parameter import Scalar, choice, parameter, pytree
 
 GRAVITY = 9.81  # m/s²
+COMMONROAD = "CommonRoad vehicle models 3.0.2, tyre of its vehicles"
 
 
 class Wheels(NamedTuple):
@@ -49,8 +50,49 @@ class Body:
 
 
 @pytree
+class MagicFormula:
+    """Coefficients of a Magic Formula tyre without camber, by their names in the literature.
+
+    p: pure slip, r: combined; c shape, d peak, e curvature, k stiffness, b steepness, h and v
+    shifts; x along the wheel, y across. The defaults are those of a passenger car.
+    """
+
+    p_cx1: Scalar = parameter(1.6411, "1", 0.1, 3, "shape, along", COMMONROAD)
+    p_dx1: Scalar = parameter(1.1739, "1", 0.01, 10, "peak friction, along", COMMONROAD)
+    p_ex1: Scalar = parameter(0.46403, "1", -50, 1, "curvature, along", COMMONROAD)
+    p_kx1: Scalar = parameter(22.303, "1", 0.1, 500, "slope over slip ratio, along", COMMONROAD)
+    p_hx1: Scalar = parameter(0.0012297, "1", -0.2, 0.2, "shift of slip ratio", COMMONROAD)
+    p_vx1: Scalar = parameter(-8.8098e-6, "1/N", -1, 1, "shift of the sine, along", COMMONROAD)
+    r_bx1: Scalar = parameter(13.276, "1", 0, 200, "steepness of the loss along", COMMONROAD)
+    r_bx2: Scalar = parameter(-13.778, "1", -200, 200, "its fall with slip ratio", COMMONROAD)
+    r_cx1: Scalar = parameter(1.2568, "1", 0, 3, "shape of the loss along", COMMONROAD)
+    r_ex1: Scalar = parameter(0.65225, "1", -50, 1, "curvature of the loss along", COMMONROAD)
+    r_hx1: Scalar = parameter(0.0050722, "1", -0.2, 0.2, "its shift of slip angle", COMMONROAD)
+    p_cy1: Scalar = parameter(1.3507, "1", 0.1, 3, "shape, across", COMMONROAD)
+    p_dy1: Scalar = parameter(1.0489, "1", 0.01, 10, "peak friction, across", COMMONROAD)
+    p_ey1: Scalar = parameter(-0.0074722, "1", -50, 1, "curvature, across", COMMONROAD)
+    p_ky1: Scalar = parameter(-21.92, "1", -500, -0.1, "slope over slip angle", COMMONROAD)
+    r_by1: Scalar = parameter(7.1433, "1", 0, 200, "steepness of the loss across", COMMONROAD)
+    r_by2: Scalar = parameter(9.1916, "1", -200, 200, "its fall with slip angle", COMMONROAD)
+    r_by3: Scalar = parameter(-0.027856, "1", -1, 1, "shift of that slip angle", COMMONROAD)
+    r_cy1: Scalar = parameter(1.0719, "1", 0, 3, "shape of the loss across", COMMONROAD)
+    r_ey1: Scalar = parameter(-0.27572, "1", -50, 1, "curvature of the loss across", COMMONROAD)
+    r_hy1: Scalar = parameter(5.7448e-6, "1", -0.2, 0.2, "its shift of slip ratio", COMMONROAD)
+    r_vy1: Scalar = parameter(-0.027825, "1", -1, 1, "force across by slip ratio", COMMONROAD)
+    r_vy4: Scalar = parameter(12.12, "1", -200, 200, "its fall with slip angle", COMMONROAD)
+    r_vy5: Scalar = parameter(1.9, "1", -10, 10, "its shape", COMMONROAD)
+    r_vy6: Scalar = parameter(-10.704, "1", -200, 200, "its steepness", COMMONROAD)
+
+
+@pytree
 class Tire:
-    """The wheels and brush tyres of one axle. Stiffness is per unit of load, so N/N per rad."""
+    """The wheels and tyres of one axle. Stiffness is per unit of load, so N/N per rad."""
+
+    law: str = choice(
+        "brush",
+        ("brush", "magic-formula"),
+        "brush: friction and stiffnesses as here; magic-formula: the table magic_formula",
+    )
 
     radius: Scalar = parameter(0.0315, "m", 0.003, 1, "rolling radius")
     width: Scalar = parameter(0.026, "m", 0.001, 1, "width, for pictures")
@@ -74,8 +116,17 @@ class Tire:
         "m/s",
         0.001,
         1,
-        "speed added to the tread's, so that slip stays finite at rest; a contact creeps below it",
+        "speed added to the tread's, so that slip stays finite at rest; a contact creeps below it. "
+        "Magic Formula: the least speed that slip is taken relative to",
     )
+    magic_formula: MagicFormula = MagicFormula()
+
+    @property
+    def peak_friction(self) -> Scalar:
+        """The largest force across the wheel over the load."""
+        if self.law == "magic-formula":
+            return self.magic_formula.p_dy1
+        return self.friction * (4 - 3 * self.sliding_ratio) / (3 - 2 * self.sliding_ratio) ** 2
 
 
 @pytree

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import tomli_w
 
-from countersteer.car.car import Car, Mount, Sensors, Sonar
+from countersteer.car.car import Car, MagicFormula, Mount, Sensors, Sonar
 from countersteer.car.parameter import (
     declarations,
     edge_unit,
@@ -148,6 +148,8 @@ def car_tables(part: Any) -> dict[str, Any]:
     }
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
+        if isinstance(value, MagicFormula) and part.law == "brush":
+            continue
         if dataclasses.is_dataclass(value):
             table[field.name] = car_tables(value)
         elif field.name == "mounts":

@@ -23,6 +23,7 @@ T = typing.TypeVar("T")
 # Unit inside -> (suffix of the name at every edge, what one unit outside is inside).
 EDGE = {
     "1": ("", 1.0),
+    "1/N": ("_pn", 1.0),
     "m": ("_m", 1.0),
     "s": ("_s", 1.0),
     "kg": ("_kg", 1.0),

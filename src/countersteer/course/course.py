@@ -230,10 +230,7 @@ def grip_speed(course: Course, car: Car) -> float:
     if course.width is None or not course.turns:
         return math.inf
     free = course.width - float(car.body.width)
-    grip = min(
-        float(t.friction * (4 - 3 * t.sliding_ratio) / (3 - 2 * t.sliding_ratio) ** 2)
-        for t in (car.tires.front, car.tires.rear)
-    )
+    grip = min(float(t.peak_friction) for t in (car.tires.front, car.tires.rear))
     radius = min(free / (1 - math.cos(abs(t.angle) / 2)) for t in course.turns)
     pairs = list(zip(course.turns, course.turns[1:], strict=False))
     if course.closed:

@@ -17,8 +17,8 @@ A contact whose slip keeps its direction is followed along the tangent of its la
 its chord, which is -k times the slip at the end of the stage. Chords alone take energy out at any
 step h and any k >= 0, as the held system is then symmetric and every mode of it is damped;
 tangents do not guarantee it. So a tick that ends with more kinetic energy than it began with and
-the motor can have put in is taken again, by one implicit Euler step on chords: it gives up order,
-and contacts cannot put energy in.
+the motor (or a Magic Formula's shift) can have put in is taken again, by one implicit Euler step
+on chords: it gives up order, and contacts cannot put energy in.
 
 Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 """
@@ -160,8 +160,11 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
     held = grip(car, middle)
     before = rotated(velocity, h / 2 * start.yaw_rate)  # in the axes of the tick's middle
     after, wheels = two_stages(car, held, steady(at_start, held), before, start.wheels, h)
-    bound = kinetic_energy(car, before, start.wheels) + h * jnp.maximum(
-        motor_power(car, held.drive, start.wheels), motor_power(car, held.drive, wheels)
+    bound = kinetic_energy(car, before, start.wheels) + h * (
+        jnp.maximum(
+            motor_power(car, held.drive, start.wheels), motor_power(car, held.drive, wheels)
+        )
+        + pushed_power(held)
     )
     holds = kinetic_energy(car, after, wheels) <= bound
     safe = implicit(car, held, CHORD, before, start.wheels, h)
@@ -214,6 +217,11 @@ def motor_power(car: Car, drive: motor.Drive, wheels: Wheels) -> Scalar:
     """Power that the motor puts in at these wheel speeds, never negative (W)."""
     driven = drivetrain.driven_speed(car, wheels)
     return jnp.maximum((drive.torque - drive.slope * driven) * driven, 0.0)
+
+
+def pushed_power(held: "Grip") -> Scalar:
+    """Power that the shifts of Magic Formula tyres put in, never negative (W)."""
+    return sum(jnp.maximum(c.force_x * c.slip_x + c.force_y * c.slip_y, 0.0) for c in held.contacts)
 
 
 def follow(car: Car, motion: Motion, goal: Command, h: Scalar) -> Motion:
@@ -289,8 +297,8 @@ def implicit(
     for c, w in zip(held.contacts, lean, strict=True):
         along.append(c.k_x + w * (c.tangent_x - c.k_x))
         across.append(c.k_y + w * (c.tangent_y - c.k_y))
-        push_x.append(w * (c.tangent_x - c.k_x) * c.slip_x)
-        push_y.append(w * (c.tangent_y - c.k_y) * c.slip_y)
+        push_x.append(c.push_x + w * (c.tangent_x - c.k_x) * c.slip_x)
+        push_y.append(c.push_y + w * (c.tangent_y - c.k_y) * c.slip_y)
     # Torque impulse per slip speed; inertia of each wheel with what resists it in the step.
     pull = [h * tire.radius * k for tire, k in zip(tires, along, strict=True)]
     bare = [tire.inertia + h * b for tire, b in zip(tires, held.drag, strict=True)]
@@ -406,7 +414,7 @@ class Forces(NamedTuple):
 
     force_x: Scalar  # N
     force_y: Scalar
-    limit: Scalar  # largest force that an adhering tread can hold at this load, N
+    limit: Scalar  # what the contact can hold at this load, N
     slip: Scalar  # speed of the contact over the ground, m/s
     angle: Scalar  # of the wheel, rad
 
@@ -418,9 +426,9 @@ def forces(car: Car, motion: Motion) -> Wheels:
     return Wheels(
         *(
             Forces(
-                -c.k_x * c.slip_x,
-                -c.k_y * c.slip_y,
-                tire.friction * load,
+                c.force_x,
+                c.force_y,
+                tyre.limit(tire, load),
                 jnp.sqrt(c.slip_x**2 + c.slip_y**2),
                 jnp.arctan2(roll.y, roll.x),
             )

@@ -1,32 +1,57 @@
-"""The brush tyre, as the stiffness of a contact against its slip velocity."""
+"""Tyres: the force of a contact at its slip, with the stiffness that an implicit step follows."""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
-from countersteer.car.car import Tire
+from countersteer.car.car import MagicFormula, Tire
 from countersteer.car.parameter import Scalar
 
 TINY = 1e-9  # keeps roots and their derivatives finite at no slip
 
 
 class Contact(NamedTuple):
-    """A contact at an instant: its slip velocity (m/s) and its stiffness against it (N s/m)."""
+    """A contact at an instant: its slip velocity (m/s) and its stiffness against it (N s/m).
+
+    Its force is push - k · slip velocity.
+    """
 
     slip_x: Scalar
     slip_y: Scalar
-    k_x: Scalar  # force over slip velocity, >= 0
+    k_x: Scalar  # >= 0
     k_y: Scalar
-    tangent_x: Scalar  # change of force over change of slip velocity, >= 0
+    push_x: Scalar  # N; none with a brush tyre
+    push_y: Scalar
+    tangent_x: Scalar  # change of -force over change of slip velocity, >= 0
     tangent_y: Scalar
+
+    @property
+    def force_x(self) -> Scalar:
+        """Along the wheel, forward (N)."""
+        return self.push_x - self.k_x * self.slip_x
+
+    @property
+    def force_y(self) -> Scalar:
+        """To the wheel's left (N)."""
+        return self.push_y - self.k_y * self.slip_y
 
 
 def contact(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar) -> Contact:
-    """A contact's stiffness, longitudinal and lateral; its force is -k · slip velocity.
+    """A contact by the tyre's law. Load in N.
 
-    The brush model with a parabolic pressure and separate friction for adhering (mu) and sliding
-    (rho mu) tread. With slip velocity s, tread speed V = sqrt((R w)² + creep²), stiffness c per
-    unit of load F, and the linear force z = |c s / V|:
+    The slip velocities are those of the contact over the ground along the wheel and to its left
+    (m/s), rim_speed is R w.
+    """
+    law = magic_formula if tire.law == "magic-formula" else brush
+    return law(tire, load, slip_x, slip_y, rim_speed)
+
+
+def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar) -> Contact:
+    """The brush model with a parabolic pressure and two frictions.
+
+    Adhering tread has mu, sliding tread rho mu. With slip velocity s, tread speed
+    V = sqrt((R w)² + creep²), stiffness c per unit of load F, and the linear force z = |c s / V|:
 
         q = min(z / (3 mu), 1)                       the part of the contact that slides
         k_i = F [ c_i (1 - q)² / V + rho mu q² (3 - 2 q) / |s| ]
@@ -37,7 +62,7 @@ def contact(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed:
     takes energy out. The largest force is F mu (4 - 3 rho) / (3 - 2 rho)².
 
     Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 3 (brush model); E. Fiala, VDI-Z 96,
-    1954. The slip speeds are those of the contact over the ground (m/s), rim_speed is R w.
+    1954.
     """
     speed = jnp.sqrt(rim_speed**2 + tire.creep_speed**2)
     linear_x = tire.longitudinal_stiffness / speed
@@ -53,4 +78,80 @@ def contact(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed:
     part_x = (slip_x**2 + TINY**2 / 2) / slip**2
     tangent_x = part_x * slope * linear_x + (1 - part_x) * k_x
     tangent_y = (1 - part_x) * slope * linear_y + part_x * k_y
-    return Contact(slip_x, slip_y, k_x, k_y, tangent_x, tangent_y)
+    return Contact(slip_x, slip_y, k_x, k_y, 0.0, 0.0, tangent_x, tangent_y)
+
+
+def magic_formula(
+    tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar
+) -> Contact:
+    """The Magic Formula in combined slip, followed along its tangents where these resist.
+
+    With the hub's speed u = slip_x + R w, slip s = slip_x / max(|u|, creep) and slip angle
+    a = atan(slip_y / max(|u|, creep)). Its shifts push even at no slip; they fade out below the
+    speed `creep`, so that a car at rest stays at rest.
+    """
+    hub = jnp.abs(slip_x + rim_speed)
+    speed = jnp.maximum(hub, tire.creep_speed)
+    moving = hub / speed
+    shifts = moving**2 * (3 - 2 * moving)
+
+    def force(slip_x: Scalar, slip_y: Scalar) -> tuple[Scalar, Scalar]:
+        return magic_forces(
+            tire.magic_formula, load, slip_x / speed, jnp.arctan(slip_y / speed), shifts
+        )
+
+    (force_x, force_y), slope_x = jax.jvp(
+        lambda x: force(x, slip_y), (slip_x,), (jnp.ones_like(slip_x),)
+    )
+    _, slope_y = jax.jvp(lambda y: force(slip_x, y), (slip_y,), (jnp.ones_like(slip_y),))
+    k_x, k_y = jnp.maximum(-slope_x[0], 0.0), jnp.maximum(-slope_y[1], 0.0)
+    return Contact(
+        slip_x, slip_y, k_x, k_y, force_x + k_x * slip_x, force_y + k_y * slip_y, k_x, k_y
+    )
+
+
+def magic_forces(
+    m: MagicFormula, load: Scalar, slip: Scalar, angle: Scalar, shifts: Scalar = 1.0
+) -> tuple[Scalar, Scalar]:
+    """Forces along the wheel and to its left (N) at a slip and a slip angle (rad).
+
+    slip is 1 - R w / u: positive while braking. Without camber, and with the sign of the sine's
+    shift as CommonRoad's code has it: inside the sine. For b slip or angle,
+
+        pure   D sin(C atan(B b - E (B b - atan B b)))     D = d load, B = k load / (C D)
+        loss   G(b) = cos(C atan(B b - E (B b - atan B b)))
+
+    the force along is that of pure slip times G(angle + shift) / G(shift), that across the same
+    with G of slip, and a shift S by slip. `shifts` scales all shifts.
+
+    Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 4; CommonRoad vehicle models 3.0.2.
+    """
+
+    def bent(b: Scalar, curvature: Scalar) -> Scalar:
+        return jnp.arctan(b - curvature * (b - jnp.arctan(b)))
+
+    def loss(steepness: Scalar, c: Scalar, e: Scalar, b: Scalar, shift: Scalar) -> Scalar:
+        shifted = jnp.cos(c * bent(steepness * (b + shift), e))
+        return shifted / jnp.cos(c * bent(steepness * shift, e))
+
+    along = m.p_kx1 / (m.p_cx1 * m.p_dx1) * (-slip + shifts * m.p_hx1)
+    pure_x = m.p_dx1 * jnp.sin(m.p_cx1 * bent(along, m.p_ex1) + shifts * load * m.p_vx1)
+    across = m.p_ky1 / (m.p_cy1 * m.p_dy1) * angle
+    pure_y = m.p_dy1 * jnp.sin(m.p_cy1 * bent(across, m.p_ey1))
+    steep_x = m.r_bx1 * jnp.cos(jnp.arctan(m.r_bx2 * slip))
+    steep_y = m.r_by1 * jnp.cos(jnp.arctan(m.r_by2 * (angle - shifts * m.r_by3)))
+    by_slip = (
+        m.r_vy1
+        * jnp.cos(jnp.arctan(m.r_vy4 * angle))
+        * jnp.sin(m.r_vy5 * jnp.arctan(m.r_vy6 * slip))
+    )
+    force_x = pure_x * loss(steep_x, m.r_cx1, m.r_ex1, angle, shifts * m.r_hx1)
+    force_y = pure_y * loss(steep_y, m.r_cy1, m.r_ey1, slip, shifts * m.r_hy1)
+    return load * force_x, load * (force_y + shifts * m.p_dy1 * by_slip)
+
+
+def limit(tire: Tire, load: Scalar) -> Scalar:
+    """The force that a contact can hold (N): a brush's adhering tread, or the formula's peak."""
+    if tire.law == "magic-formula":
+        return jnp.maximum(tire.magic_formula.p_dx1, tire.magic_formula.p_dy1) * load
+    return tire.friction * load
