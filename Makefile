@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; 
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: drive test check accuracy clean
+.PHONY: drive test check accuracy notebook clean
 
 drive: $(READY)
 	$(BIN)/countersteer drive box
@@ -20,6 +20,16 @@ check: $(READY)
 
 accuracy: $(READY)
 	$(BIN)/python -m countersteer.evaluation.accuracy docs/accuracy.md
+
+# Jupyter is some thirty packages: only who changes the notebook needs it.
+notebook: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints.txt --editable '.[notebook]'
+	$(BIN)/python -c "import sys, nbclient, nbformat; name = sys.argv[1]; \
+		book = nbformat.read(name, 4); \
+		nbclient.NotebookClient(book, record_timing=False).execute(); \
+		nbformat.write(book, name)" examples/drift.ipynb
+	$(BIN)/ruff format examples/drift.ipynb
 
 $(READY): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: make PYTHON=..."; exit 1; }

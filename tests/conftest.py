@@ -1,6 +1,5 @@
 """What the tests share: 64-bit floats, JAX's cache on disk, and programs that compile once."""
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from countersteer.car.car import Car
+from countersteer.car.parameter import changed
 from countersteer.simulator import keep_programs
 from countersteer.world import planar
 from countersteer.world.state import Motion, State
@@ -48,14 +48,7 @@ def stacked(trees: list) -> object:
 def varied(car: Car, changes: dict[str, float]) -> Car:
     """The car with parameters replaced by dotted name, in the units used inside."""
     for path, value in changes.items():
-        *rooms, name = path.split(".")
-        parts = [car]
-        for room in rooms:
-            parts.append(getattr(parts[-1], room))
-        part = dataclasses.replace(parts[-1], **{name: np.float64(value)})
-        for room, holder in zip(reversed(rooms), reversed(parts[:-1]), strict=True):
-            part = dataclasses.replace(holder, **{room: part})
-        car = part
+        car = changed(car, path, np.float64(value))
     return car
 
 

@@ -3,10 +3,12 @@
 import json
 import math
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -16,14 +18,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from countersteer import cli
-from countersteer.car.car import Car
-from countersteer.car.files import library, load_car, save_car
+from countersteer.car.files import library, load_car, parameters, save_car
+from countersteer.completion import every_action, script
 from countersteer.course.course import grip_speed, place, progress
 from countersteer.course.files import library as courses
 from countersteer.course.files import load_course
 from countersteer.errors import InputError
 from countersteer.runs.files import column_rows, command_rows, read_commands, read_table
 from countersteer.runs.run import read_run
+from countersteer.runs.writer import new_folder
+from countersteer.text import read_text
 
 COMMANDS = "time_s,throttle,direction,steering_deg\n"
 
@@ -61,6 +65,10 @@ def test_overrides_reach_any_declared_parameter():
         ("[wings]\nspan_m = 1.0", "unknown key wings"),
         ("body = 3", "body must be a table"),
         ("base = 'no-such-car'", "no car no-such-car"),
+        ("base = 'car.toml'", "base must name another car, not 'car.toml'"),
+        ("", "holds no parameter"),
+        ("[source]\nall = 'nowhere'", "holds no parameter"),
+        ("description = 3", "description must be a text"),
         ("[body\n", "not valid TOML"),
         ("[body]\nfront_axle_m = 0.3\nwheelbase_m = 0.2", "front_axle_m must be less"),
         ("[sensors.sonar]\nfiring = 'never'", "must be one of together, in-turn"),
@@ -87,6 +95,7 @@ def test_a_wrong_car_is_refused_in_one_line(text, says, tmp_path):
         ("width_m = 1\nsegments = [{bend = 90}]", "segments[0] must be"),
         ("width_m = 1\nlength_m = 3\nsegments = []", "unknown key length_m"),
         ("width_m = 1\nclosed = true\nsegments = [{straight_m = 1.0}]", "do not come back"),
+        ("name = 'x'\nwidth_m = 1\nclosed = true\nsegments = [{straight_m = 1}]", "not come back"),
         ("walls_m = [[[0, 0]]]", "walls_m[0] must hold two or more points"),
         ("width_m = 1\nsegments = [{straight_m = 1}]\n[start]\ndistance_m = 2", "start.distance_m"),
         ("width_m = 1\nsegments = [{straight_m = 1}]\n[start]\noffset_m = 2", "start.offset_m"),
@@ -141,23 +150,36 @@ def test_wrong_commands_are_refused_in_one_line(rows, says, tmp_path):
         ["drive", "box", "--speed-mps", "fast"],
         ["drive", "box", "--dt", "0"],
         ["drive", "box", "--laps", "0"],
+        ["drive", "ess", "--laps", "2"],
+        ["drive", "/dev/zero"],
+        ["drive", "box", "--driver", "endless.csv"],
+        ["drive", "box", "--car", "endless.toml"],
+        ["drive", "box", "--driver", "short.csv", "--speed-mps", "2"],
+        ["list", "cars", "--car", "rx7"],
+        ["completion", "ksh"],
         ["drive", "box", "--frobnicate"],
         ["fly", "box"],
         ["replay", "missing"],
         ["replay", "missing", "--initial", "vx_mps=2"],
         ["replay", "missing", "--compare"],
+        ["replay", "short.csv", "--horizon", "1"],
+        ["replay", "short.csv", "--compare", "--initial", "vx_mps=2"],
         ["import", "dart", "missing.csv", "--out", "somewhere"],
         ["import", "betamax", "missing.csv", "--out", "somewhere"],
     ],
 )
 def test_wrong_arguments_end_with_status_2_and_one_line(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for name in ("endless.toml", "endless.csv"):
+        Path(name).symlink_to("/dev/zero")
+    Path("short.csv").write_text(COMMANDS + "0,0,forward,0\n")
+    before = set(tmp_path.iterdir())
     assert cli.main(arguments) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert len(printed.err.strip().splitlines()) == 1
     assert printed.err.startswith("countersteer: ")
-    assert list(tmp_path.iterdir()) == []
+    assert set(tmp_path.iterdir()) == before
 
 
 @settings(max_examples=50, deadline=None)
@@ -182,10 +204,50 @@ def test_tables_round_trip(tmp_path_factory, values):
     np.testing.assert_array_equal(read_table(path, ("time_s",))["value"], np.array(values))
 
 
-def test_a_line_that_was_cut_off_is_passed_over(tmp_path):
+def test_a_line_that_was_cut_off_is_passed_over_and_said(tmp_path, caplog):
     path = tmp_path / "table.csv"
+    path.write_text("time_s,x_m,y_m\n0,1,2\n0.1,1.5,2")
+    assert len(read_table(path, ("time_s",))) == 2
+    assert not caplog.messages
     path.write_text("time_s,x_m,y_m\n0,1,2\n0.1,1.5")
     assert len(read_table(path, ("time_s",))) == 1
+    assert caplog.messages == [f"{path}: its last line, cut off in the middle, is passed over"]
+
+
+def test_a_base_is_looked_for_beside_the_car_that_names_it(tmp_path, monkeypatch):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "base.toml").write_text("base = 'rx7'\n[body]\nmass_kg = 1.9")
+    (tmp_path / "mine" / "car.toml").write_text("base = '../base.toml'")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert load_car("../mine/car.toml").body.mass == 1.9
+    assert load_car(str(tmp_path / "mine" / "car.toml")).body.mass == 1.9
+    (tmp_path / "base.toml").write_text("base = 'elsewhere/../mine/car.toml'")
+    with pytest.raises(InputError, match="base must name another car"):
+        load_car("../mine/car.toml")
+
+
+def test_what_is_too_large_is_refused(tmp_path):
+    path = tmp_path / "large.toml"
+    path.write_text("#" * 2000)
+    assert len(read_text(path, 0.002)) == 2000
+    with pytest.raises(
+        InputError, match=r"large\.toml: cannot be read: it is larger than 0\.001 MB"
+    ):
+        read_text(path, 0.001)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="it is not text"):
+        read_text(path)
+
+
+def test_drives_at_once_get_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: new_folder(None, "box"), range(40)))
+    assert sorted(folders) == [Path("runs") / f"box-{i:03d}" for i in range(1, 41)]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be made"):
+        new_folder(tmp_path / "file" / "run", "box")
 
 
 def test_the_box_states_its_grip_speed():
@@ -219,11 +281,109 @@ def test_box_has_four_right_turns_and_closes():
 
 
 def test_every_parameter_is_declared_with_unit_range_and_meaning():
-    from countersteer.car.files import parameter_lines
+    found = parameters()
+    assert len(found) > 80
+    assert len({entry["path"] for entry in found}) == len(found)
+    for entry in found:
+        assert len(entry["meaning"]) > 5, entry
+        if entry["choices"]:
+            assert entry["default"] in entry["choices"]
+        else:
+            assert entry["low"] <= entry["default"] <= entry["high"]
 
-    lines = parameter_lines(Car())
-    assert len(lines) > 80
-    assert all(len(line.split("]")[1].split("(default")[0].strip()) > 10 for line in lines)
+
+@pytest.mark.parametrize("name", library())
+def test_the_parameters_that_are_listed_make_the_car(name):
+    """Each path and value, given to `--set`, leads from another car to this one."""
+    car = load_car(name)
+    other = next(other for other in library() if other != name)
+    again = load_car(other, [f"{p['path']}={p['value']}" for p in parameters(car)])
+    for one, two in zip(jax.tree.leaves(car), jax.tree.leaves(again), strict=True):
+        assert one == pytest.approx(two, rel=1e-11)
+
+
+def test_lists_tell_one_from_another_and_align(capsys):
+    for what, count in (("cars", len(library())), ("courses", len(courses())), ("drivers", 2)):
+        assert cli.main(["list", what]) == 0
+        text = capsys.readouterr().out
+        assert cli.main(["list", what, "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)[what]
+        assert len(found) == len(text.splitlines()) >= count
+        assert all(len(line) > 30 for line in text.splitlines())
+        # The second column starts at the same place in every line.
+        width = max(len(item["name"]) for item in found)
+        for item, line in zip(found, text.splitlines(), strict=True):
+            assert line[: width + 2].rstrip() == item["name"]
+            assert line[width + 2] != " "
+    assert cli.main(["list", "cars", "--json"]) == 0
+    (rx7,) = [c for c in json.loads(capsys.readouterr().out)["cars"] if c["name"] == "rx7"]
+    assert (rx7["mass_kg"], rx7["wheelbase_m"], rx7["drive"]) == (1.6, 0.25, "4WD")
+    assert rx7["description"]
+    assert cli.main(["list", "parameters", "--car", "rx7", "--json"]) == 0
+    listed = {p["path"]: p for p in json.loads(capsys.readouterr().out)["parameters"]}
+    servo = listed["servo.limit_left_deg"]
+    assert (servo["value"], servo["low"], servo["high"], servo["unit"]) == (28, 1, 65, "deg")
+    assert listed["sensors.sonar.mounts.left.angle_deg"]["value"] == 90
+
+
+def test_every_option_has_help():
+    for action in every_action(cli.parser()):
+        assert action.help or action.dest == "verb", action
+
+
+BASH = """
+source completion
+COMP_WORDS=("${@:1}") COMP_CWORD=$(($# - 1))
+_countersteer_complete 2> /dev/null  # compopt: no line is being completed
+echo "${COMPREPLY[@]}"
+"""
+
+
+@pytest.fixture(scope="module")
+def completions(tmp_path_factory):
+    """What bash offers for the last word of a command."""
+    folder = tmp_path_factory.mktemp("completion")
+    (folder / "completion").write_text(script(cli.parser(), "bash", cli.DRIVERS))
+    (folder / "my car.toml").write_text("")
+
+    def offered(*words: str) -> str:
+        done = subprocess.run(
+            ["bash", "-c", BASH, "bash", "countersteer", *words],
+            cwd=folder, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert not done.stderr
+        return done.stdout.strip()
+
+    return offered
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (("dr",), "drive"),
+        (("drive", "e"), "ess"),
+        (("drive", "box", "--lap"), "--laps"),
+        (("drive", "box", "--car", "rx"), "rx7"),
+        (("drive", "box", "--car", "my"), "my car.toml"),
+        (("drive", "box", "--driver", "str"), "straighten"),
+        (("drive", "box", "--link", ""), "onboard radio"),
+        (("drive", "box", "--set", "servo.limit_l"), "servo.limit_left_deg="),
+        (("list", "para"), "parameters"),
+        (("replay", "comp"), "completion"),
+    ],
+)
+def test_bash_completes(words, offered, completions):
+    assert completions(*words) == offered
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_take_their_script(shell, tmp_path):
+    text = script(cli.parser(), shell, cli.DRIVERS)
+    for word in ("drive", "estimate", "rx7", "box", "drift-turn", "battery.wear="):
+        assert word in text
+    if shutil.which(shell):
+        (tmp_path / "script").write_text(text)
+        subprocess.run([shell, "-n", str(tmp_path / "script")], check=True)
 
 
 def test_a_run_that_is_there_is_moved_aside(tmp_path, capsys):
@@ -291,13 +451,24 @@ def test_a_full_disk_is_one_line_and_what_was_written_reads(tmp_path):
     assert len(read_run(out).truth) > 10
 
 
+def test_the_package_runs_as_a_module(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "countersteer", "list", "cars"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "rx7" in done.stdout
+
+
 def test_help_comes_without_loading_the_physics():
     done = subprocess.run(
         [
             sys.executable,
             "-c",
             "import sys, countersteer.cli as c\ntry: c.main(['--help'])\nexcept SystemExit: pass\n"
-            "print(sorted(m for m in sys.modules if m in ('jax', 'numpy', 'matplotlib')))",
+            "print(sorted(m for m in sys.modules if m in ('jax', 'numpy', 'matplotlib', 'shtab')))",
         ],
         capture_output=True,
         text=True,

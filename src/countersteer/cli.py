@@ -87,7 +87,13 @@ def parser() -> Parser:
         help=f"{', '.join(DRIVERS)}, or a commands.csv (default drift-turn)",
     )
     physics(drive, "rx7")
-    drive.add_argument("--laps", type=number(1, 1000, int), default=1, metavar="N")
+    drive.add_argument(
+        "--laps",
+        type=number(1, 1000, int),
+        default=1,
+        metavar="N",
+        help="of a closed course (default 1)",
+    )
     drive.add_argument(
         "--speed-mps",
         type=number(0.2, 20),
@@ -98,7 +104,13 @@ def parser() -> Parser:
     drive.add_argument(
         "--battery", type=number(0, 1), default=1.0, metavar="F", help="charge, 0 to 1 (default 1)"
     )
-    drive.add_argument("--link", choices=("onboard", "radio"), default="onboard")
+    drive.add_argument(
+        "--link",
+        choices=("onboard", "radio"),
+        default="onboard",
+        help="where the driver runs: in the car, or behind a radio that delays and loses packets "
+        "(default onboard)",
+    )
     drive.add_argument(
         "--estimate",
         choices=("filter", "truth"),
@@ -107,23 +119,38 @@ def parser() -> Parser:
     )
 
     replay = verb("replay", "commands in, motion out; or a log against the simulator", run_replay)
-    replay.add_argument("source", type=Path, metavar="COMMANDS_OR_RUN")
+    replay.add_argument(
+        "source", type=Path, metavar="COMMANDS_OR_RUN", help="a commands.csv, or a run's folder"
+    )
     physics(replay, None)
     replay.add_argument(
         "--initial", default="", metavar="STATES", help='such as "vx_mps=2,yaw_rate_radps=1"'
     )
     replay.add_argument("--compare", action="store_true", help="measured against simulated")
     replay.add_argument(
-        "--horizon", default="1.0", metavar="S|run", help="of the comparison (default 1.0 s)"
+        "--horizon",
+        metavar="S|run",
+        help="seconds that are predicted at a time, or run: the whole of it (with --compare; "
+        "default 1.0)",
     )
 
     take = verb("import", "other people's logs to run folders", run_import)
     take.add_argument("format", choices=("dart",), metavar="FORMAT", help="dart")
-    take.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    take.add_argument("--out", type=Path, required=True, metavar="DIR")
+    take.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a log")
+    take.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the run folders"
+    )
 
     lists = verb("list", "what there is by name", run_list)
-    lists.add_argument("what", choices=("cars", "courses", "drivers", "parameters"))
+    lists.add_argument(
+        "what",
+        choices=("cars", "courses", "drivers", "parameters"),
+        help="parameters: all that --set takes",
+    )
+    lists.add_argument("--car", help="with parameters: the values of this car")
+
+    complete = verb("completion", "a script that completes commands in a shell", run_completion)
+    complete.add_argument("shell", choices=("bash", "zsh", "fish"), help="the shell it is for")
     return top
 
 
@@ -152,6 +179,8 @@ def run_drive(options: argparse.Namespace) -> int:
     from countersteer.simulator import Simulator
 
     course, car = load_course(options.course), load_car(options.car, options.set)
+    if options.laps > 1 and not course.closed:
+        raise InputError(f"--laps {options.laps}: {options.course} is open, and driven once")
     driver = make_driver(
         options.driver, course, load_car(options.car), options.speed_mps, options.laps
     )
@@ -180,6 +209,10 @@ def run_replay(options: argparse.Namespace) -> int:
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator
 
+    if options.horizon and not options.compare:
+        raise InputError("--horizon is of a comparison: give --compare as well")
+    if options.initial and options.compare:
+        raise InputError("--initial: --compare starts from what was measured")
     run = read_run(options.source) if options.source.is_dir() else None
     if run is None and not options.source.exists():
         raise InputError(f"{options.source}: no such run folder or commands.csv")
@@ -267,7 +300,7 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) ->
     from countersteer.simulator import keep_programs
 
     keep_programs()
-    horizon = None if options.horizon == "run" else read_horizon(options.horizon)
+    horizon = None if options.horizon == "run" else read_horizon(options.horizon or "1.0")
     result, series = compare(run, car, horizon, options.dt)
     out = options.out or run.path
     out.mkdir(parents=True, exist_ok=True)
@@ -300,21 +333,29 @@ def run_import(options: argparse.Namespace) -> int:
 
 def run_list(options: argparse.Namespace) -> int:
     """`list`."""
-    if options.what == "parameters":
-        from countersteer.car.files import parameter_lines
+    from countersteer import listing
 
-        lines = parameter_lines()
-    elif options.what == "drivers":
-        lines = list(DRIVERS)
-    elif options.what == "cars":
-        from countersteer.car.files import library
-
-        lines = library()
+    if options.car and options.what != "parameters":
+        raise InputError("--car: goes with list parameters")
+    found = {
+        "cars": listing.cars,
+        "courses": listing.courses,
+        "drivers": lambda: listing.drivers(DRIVERS),
+        "parameters": lambda: listing.parameters(options.car),
+    }[options.what]()
+    if options.json:
+        print(json.dumps({options.what: found}))
     else:
-        from countersteer.course.files import library as courses
+        print("\n".join(listing.lines(options.what, found)))
+    return DONE
 
-        lines = courses()
-    print(json.dumps({options.what: lines}) if options.json else "\n".join(lines))
+
+def run_completion(options: argparse.Namespace) -> int:
+    """`completion`."""
+    from countersteer.completion import script
+
+    text = script(parser(), options.shell, DRIVERS)
+    print(json.dumps({"script": text}) if options.json else text)
     return DONE
 
 
@@ -328,6 +369,8 @@ def make_driver(
     from countersteer.runs.files import read_commands
 
     if name.endswith(".csv"):
+        if speed is not None:
+            raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
         commands = read_commands(Path(name))
         return Replay(
             times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]

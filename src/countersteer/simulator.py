@@ -149,6 +149,11 @@ class Simulator:
             before = record
         yield jax.tree.map(np.asarray, before)
 
+    def record(self, longest: float) -> Record:
+        """The whole of `run` at once, cut off at `longest`: for drives of seconds to minutes."""
+        last = round(longest / self.dt)
+        return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:last], *self.run(longest))
+
     def begin(self, plan: Plan) -> tuple[Surroundings, Loop]:
         """The loop before its first tick."""
         dtype = np.asarray(self.car.body.mass).dtype

@@ -12,11 +12,19 @@ import jax
 import numpy as np
 import tomli_w
 
-from countersteer.car.car import Car, MagicFormula, Mount, Sonar
-from countersteer.car.parameter import declarations, read_value, unknown_key, write_value
+from countersteer.car.car import Car, MagicFormula, Mount, Sensors, Sonar
+from countersteer.car.parameter import (
+    declarations,
+    edge_unit,
+    read_value,
+    unknown_key,
+    write_value,
+)
 from countersteer.errors import InputError
+from countersteer.text import read_text
 
 LIBRARY = importlib.resources.files("countersteer.car") / "library"
+LARGEST = 10  # MB of a file that a person writes
 
 
 def library() -> list[str]:
@@ -33,13 +41,11 @@ def read_toml(name: str, shelf: Any, kind: str) -> tuple[dict[str, Any], str]:
     path = Path(name)
     try:
         if entry.is_file() and "/" not in name:
-            return tomllib.loads(entry.read_text()), name
+            return tomllib.loads(read_text(entry)), name
         if path.suffix == ".toml":
-            return tomllib.loads(path.read_text()), str(path)
+            return tomllib.loads(read_text(path, LARGEST)), str(path)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{name}: not valid TOML: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{name}: cannot be read: {error}") from None
     known = ", ".join(sorted(p.name.removesuffix(".toml") for p in shelf.iterdir()))
     raise InputError(f"no {kind} {name}: give one of {known}, or the path of a .toml file")
 
@@ -80,19 +86,24 @@ def check(car: Car, where: str) -> None:
         raise InputError(f"{where}: motor.dead_zone must be less than motor.full_throttle")
 
 
-def _load(name: str, seen: tuple[str, ...]) -> Car:
+def _load(name: str, seen: tuple[Path, ...]) -> Car:
+    """A car with its bases; `seen` holds the files that led to it."""
     tables, where = read_toml(name, LIBRARY, "car")
-    base = tables.pop("base", None)
-    source = tables.pop("source", {})
+    base, source = tables.pop("base", None), tables.pop("source", {})
     if not isinstance(source, dict):
         raise InputError(f"{where}: [source] must be a table of texts")
+    if not isinstance(tables.pop("description", ""), str):
+        raise InputError(f"{where}: description must be a text")
     if base is None:
-        car = Car()
-    elif not isinstance(base, str) or base in seen or base == name:
-        raise InputError(f"{where}: base must name another car, not {base!r}")
-    else:
-        car = _load(base, (*seen, name))
-    return _merge(car, tables, where, "")
+        if not tables:
+            raise InputError(f"{where}: holds no parameter: give a base, or tables such as [body]")
+        return _merge(Car(), tables, where, "")
+    seen = (*seen, Path(name).resolve())
+    if isinstance(base, str):
+        other = str(Path(name).parent / base) if base.endswith(".toml") else base
+        if Path(other).resolve() not in seen:
+            return _merge(_load(other, seen), tables, where, "")
+    raise InputError(f"{where}: base must name another car, not {base!r}")
 
 
 def _merge(part: Any, table: Any, where: str, path: str) -> Any:
@@ -161,26 +172,44 @@ def save_car(car: Car, path: Path, source: dict[str, str]) -> None:
     path.write_text(tomli_w.dumps({"source": source, **car_tables(car)}))
 
 
-def parameter_lines(part: Any = None, path: str = "") -> list[str]:
-    """Every parameter: path, range with unit, default, meaning, source of the default."""
-    part = Car() if part is None else part
-    lines = []
+def parameters(car: Car | None = None) -> list[dict[str, Any]]:
+    """Every parameter of a car as it stands at an edge, in the order of declaration.
+
+    `path` is what `--set` takes, `value` is the car's, `low` and `high` are its range (None where
+    there are `choices` instead), `source` is that of the default, `unit` that of all its numbers.
+    Without a car the values are the defaults, and sonars go by NAME.
+    """
+    plain = Sonar(mount_names=("NAME",), mounts=(Mount(),))
+    return _parameters(car or Car(sensors=Sensors(sonar=plain)), "")
+
+
+def _parameters(part: Any, path: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
     for key, (name, declared) in declarations(type(part)).items():
-        value = write_value(declared, getattr(part, name))
-        if declared.choices:
-            span = " | ".join(declared.choices)
-        else:
-            span = "{:g} … {:g}".format(
-                *(write_value(declared, bound) for bound in (declared.low, declared.high))
-            )
-            value = f"{value:g}"
-        lines.append(
-            f"{path}{key} = {value}  [{span}]  {declared.meaning} (default: {declared.source})"
+        default = getattr(type(part)(), name)
+        value, default, low, high = (
+            # Degrees that were radians in between lose their last digits.
+            v if declared.choices else float(f"{write_value(declared, v):.12g}")
+            for v in (getattr(part, name), default, declared.low, declared.high)
+        )
+        found.append(
+            {
+                "path": f"{path}{key}",
+                "unit": edge_unit(declared),
+                "value": value,
+                "low": None if declared.choices else low,
+                "high": None if declared.choices else high,
+                "choices": list(declared.choices),
+                "default": default,
+                "meaning": declared.meaning,
+                "source": declared.source,
+            }
         )
     for field in dataclasses.fields(part):
         inner = getattr(part, field.name)
         if dataclasses.is_dataclass(inner):
-            lines += parameter_lines(inner, f"{path}{field.name}.")
+            found += _parameters(inner, f"{path}{field.name}.")
         elif field.name == "mounts":
-            lines += parameter_lines(Mount(), f"{path}mounts.NAME.")
-    return lines
+            for name, mount in zip(part.mount_names, inner, strict=True):
+                found += _parameters(mount, f"{path}mounts.{name}.")
+    return found

@@ -116,6 +116,22 @@ def write_value(declared: Declaration, value: Any) -> Any:
     return value if declared.choices else float(value) / EDGE[declared.unit][1]
 
 
+def edge_unit(declared: Declaration) -> str:
+    """The unit of the number that `write_value` gives."""
+    return {"C": "A h"}.get(declared.unit, declared.unit.replace("rad", "deg"))
+
+
+def changed(part: T, path: str, value: Scalar) -> T:
+    """`part` with one parameter replaced, such as `tires.rear.friction` of a car.
+
+    `path` holds names inside and `value` is in the unit used inside, unchecked; it may be traced.
+    """
+    name, _, rest = path.partition(".")
+    value = changed(getattr(part, name), rest, value) if rest else value
+    replaced: T = dataclasses.replace(part, **{name: value})  # type: ignore[type-var]  # T is a pytree
+    return replaced
+
+
 def unknown_key(where: str, key: str, known: Mapping[str, Any]) -> InputError:
     """The error for a key that nothing declares, with the nearest ones that something does."""
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)

@@ -1,5 +1,6 @@
 """Courses in TOML files."""
 
+import dataclasses
 import importlib.resources
 import itertools
 import math
@@ -56,7 +57,8 @@ def course_from_tables(tables: dict[str, Any], where: str) -> Course:
     if not isinstance(segments, list) or not all(isinstance(s, dict) for s in segments):
         raise InputError(f"{where}: segments must be a list of {{straight_m}} and {{turn_deg}}")
     read = [_segment(s, f"{where}: segments[{i}]") for i, s in enumerate(segments)]
-    return from_segments(title, width, closed, read, (start[0], start[1], start[2]), goal)
+    course = from_segments(where, width, closed, read, (start[0], start[1], start[2]), goal)
+    return dataclasses.replace(course, name=title)  # until here its errors name the file
 
 
 def _segment(segment: dict[str, Any], where: str) -> tuple[str, float, float]:

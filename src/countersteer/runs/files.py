@@ -1,6 +1,7 @@
 """Tables in files: CSV columns as arrays, read strictly and written so that they round-trip."""
 
 import csv
+import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -9,6 +10,9 @@ from typing import TextIO
 import numpy as np
 
 from countersteer.errors import InputError
+from countersteer.text import read_text
+
+log = logging.getLogger(__name__)
 
 COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
 TRUTH = (
@@ -41,19 +45,16 @@ def read_table(path: Path, required: Iterable[str], text: Sequence[str] = ()) ->
     """A CSV file with a header as columns of numbers; empty cells are NaN.
 
     Columns named in `text` stay as they are. The table ends before a last line that was cut off
-    in the middle (a process that was killed). Raises `InputError` with the line where the file is
-    not what it should be: no header, missing columns, no number, a time that goes backwards.
+    in the middle (a process that was killed), and a warning is logged. Raises `InputError` with
+    the line where the file is not what it should be: no header, missing columns, no number, a time
+    that goes backwards.
     """
-    try:
-        content = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise InputError(f"{path}: cannot be read: {reason}") from None
+    content = read_text(path)
     lines = content.splitlines()
-    if lines and not content.endswith("\n"):
-        lines = (
-            lines[:-1] if len(lines) > 1 and lines[-1].count(",") < lines[0].count(",") else lines
-        )
+    whole = content.endswith("\n") or len(lines) < 2
+    if not whole and lines[-1].count(",") < lines[0].count(","):
+        log.warning("%s: its last line, cut off in the middle, is passed over", path)
+        lines = lines[:-1]
     rows = csv.reader(lines)
     header = next(rows, [])
     missing = [name for name in required if name not in header]

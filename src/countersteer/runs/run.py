@@ -11,6 +11,7 @@ from countersteer.car.car import Car
 from countersteer.car.files import car_from_tables
 from countersteer.errors import InputError
 from countersteer.runs.files import Table, read_commands, read_table
+from countersteer.text import read_text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,12 +43,12 @@ def read_run(path: Path) -> Run:
     """A run's folder. Raises `InputError` where it is not one."""
     if not path.is_dir():
         raise InputError(f"{path}: no such run folder")
+    if not (path / "run.toml").exists():
+        raise InputError(f"{path}: not a run: it has no run.toml")
     try:
-        about = tomllib.loads((path / "run.toml").read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path}: not a run: it has no run.toml") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}/run.toml: cannot be read: {error}") from None
+        about = tomllib.loads(read_text(path / "run.toml"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}/run.toml: not valid TOML: {error}") from None
     telemetry, truth = path / "telemetry.csv", path / "truth.csv"
     return Run(
         path,

@@ -30,8 +30,7 @@ def new_folder(out: Path | None, name: str) -> Path:
     Raises `InputError` where the folder holds something that is no run.
     """
     if out is None:
-        numbered = (Path("runs") / f"{name}-{number:03d}" for number in itertools.count(1))
-        out = next(path for path in numbered if not path.exists())
+        return _numbered(Path("runs"), name)
     try:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             if not (out / "run.toml").exists():
@@ -42,6 +41,20 @@ def new_folder(out: Path | None, name: str) -> Path:
     except OSError as error:
         raise InputError(f"{out}: cannot be made: {error.strerror}") from None
     return out
+
+
+def _numbered(parent: Path, name: str) -> Path:
+    """A folder of the first free number; two drives at once get two."""
+    number = 1
+    while True:
+        folder = parent / f"{name}-{number:03d}"
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
 
 
 class RunWriter:

@@ -1,0 +1,5 @@
+"""`python -m countersteer` is the command."""
+
+from countersteer.cli import entry
+
+entry()

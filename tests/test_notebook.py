@@ -1,0 +1,54 @@
+"""The notebook: its cells run as they stand, and what it shows was made by running them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+NOTEBOOK = Path(__file__).parents[1] / "examples" / "drift.ipynb"
+LARGEST = 300_000  # bytes, outputs included
+
+CHECKS = """
+assert len(motion.x) == 6500
+assert record.turn[-1] == 3 and record.wall_contacts[-1] == 0
+assert 25 < np.degrees(np.abs(sideslip).max()) < 60
+# The less the rear tyres hold, the wilder the drift; with rubber there is none.
+assert np.all(np.diff(slips[3:10]) < 0) and slips[3] > 45 and np.all(slips[11:] < 12)
+assert len(plt.get_fignums()) == 3
+"""
+
+
+@pytest.fixture(scope="module")
+def cells() -> list[dict]:
+    return json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+
+
+def test_the_notebook_runs_as_it_stands(cells, tmp_path):
+    """In a process of its own, as in Jupyter: nothing is set but where pictures go."""
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "\n\n".join([*code, CHECKS])],
+        cwd=tmp_path,
+        env={**os.environ, "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    shown = "".join("".join(output.get("text", "")) for output in outputs)
+    assert done.stdout == shown, "the notebook shows what was: make notebook"
+
+
+def test_the_outputs_are_of_one_run_from_top_to_bottom(cells):
+    assert len(cells) == 10
+    assert NOTEBOOK.stat().st_size < LARGEST
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    outputs = [output for cell in code for output in cell["outputs"]]
+    assert {output["output_type"] for output in outputs} == {"stream", "display_data"}
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+    assert not any(output.get("name") == "stderr" for output in outputs)
