@@ -78,7 +78,9 @@ class MagicFormula:
     r_cy1: Scalar = parameter(1.0719, "1", 0, 3, "shape of the loss across", COMMONROAD)
     r_ey1: Scalar = parameter(-0.27572, "1", -50, 1, "curvature of the loss across", COMMONROAD)
     r_hy1: Scalar = parameter(5.7448e-6, "1", -0.2, 0.2, "its shift of slip ratio", COMMONROAD)
-    r_vy1: Scalar = parameter(-0.027825, "1", -1, 1, "force across that slip ratio makes", COMMONROAD)
+    r_vy1: Scalar = parameter(
+        -0.027825, "1", -1, 1, "force across that slip ratio makes", COMMONROAD
+    )
     r_vy4: Scalar = parameter(12.12, "1", -200, 200, "its fall with slip angle", COMMONROAD)
     r_vy5: Scalar = parameter(1.9, "1", -10, 10, "shape of that force", COMMONROAD)
     r_vy6: Scalar = parameter(-10.704, "1", -200, 200, "its steepness", COMMONROAD)
