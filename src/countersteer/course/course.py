@@ -145,9 +145,7 @@ def walls_around(area: "Polygon", where: str) -> np.ndarray:
     rings = [np.asarray(ring.coords) for ring in (area.exterior, *area.interiors)]
     walls = np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in rings])
     if len(walls) > MOST_WALLS:
-        raise InputError(
-            f"{where}: {len(walls)} pieces of wall, over {MOST_WALLS}"
-        )
+        raise InputError(f"{where}: {len(walls)} pieces of wall, over {MOST_WALLS}")
     return walls
 
 

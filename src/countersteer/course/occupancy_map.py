@@ -16,7 +16,7 @@ from countersteer.course.course import Course, from_track, from_walls, walls_aro
 from countersteer.errors import InputError
 
 TOLERANCE = 0.02  # m by which walls may be from the edge between pixels, ...
-PIXELS = 0.75  # ... or so many pixels, if that is more: a slanting edge is a staircase
+PIXELS = 1.0  # ... or so many pixels, if that is more: a slanting edge is a staircase
 SPECK = 4  # pixels: what is smaller within free space is noise, not a wall
 SMOOTH = 4.0  # pixels: standard deviation of the filter along a centre line
 MOST_PIXELS = 40_000_000
