@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from countersteer.car.car import GRAVITY, Car
+from countersteer.car.car import GRAVITY, Car, Tire
 from countersteer.car.files import load_car
 from countersteer.car.parameter import Array, Scalar, pytree
 from countersteer.course.course import Course, progress
@@ -107,7 +107,7 @@ def middle(course: Course) -> np.ndarray:
     return gaussian_filter1d(line, SMOOTH * POINTS / course.length, axis=0, mode="wrap")
 
 
-def peak_friction(tire: object) -> float:
+def peak_friction(tire: Tire) -> float:
     """The most that a brush tyre gives."""
     ratio = tire.sliding_ratio
     return float(tire.friction * (4 - 3 * ratio) / (3 - 2 * ratio) ** 2)

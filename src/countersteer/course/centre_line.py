@@ -29,7 +29,7 @@ def read_centre_line(path: Path) -> Course:
     """
     table = _rows(path)
     points, sides = table[:, :2], table[:, 2:]
-    fresh = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > SAME
+    fresh = np.hypot(*(points - np.roll(points, -1, axis=0)).T) > SAME
     points, sides = points[fresh], sides[fresh]
     if not 3 <= len(points) <= MOST_POINTS:
         raise InputError(f"{path}: {len(points)} points that differ, not 3 to {MOST_POINTS}")

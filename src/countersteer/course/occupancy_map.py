@@ -92,7 +92,7 @@ def _about(path: Path) -> dict[str, Any]:
     try:
         about = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:
-        raise InputError(f"{path}: not valid YAML: {error}") from None
+        raise InputError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     except RecursionError:
         raise InputError(f"{path}: not valid YAML: too deep") from None
     except UnicodeDecodeError:
