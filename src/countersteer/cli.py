@@ -81,7 +81,12 @@ def parser() -> Parser:
         made.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
 
     drive = verb("drive", "one closed-loop drive over a course", run_drive)
-    drive.add_argument("course", metavar="COURSE", help="library name or .toml file")
+    drive.add_argument(
+        "course",
+        metavar="COURSE",
+        help="library name, or a file: .toml, a centre line with widths .csv (F1TENTH), "
+        "a map .yaml with its image (ROS)",
+    )
     drive.add_argument(
         "--driver",
         default="drift-turn",
