@@ -274,10 +274,10 @@ def drive(
     with RunWriter(folder, about, headers) as writer:
         with Interrupt() as interrupt, contextlib.closing(simulator.run(longest)) as pieces:
             for record in pieces:
+                interrupt.begin()
                 log, end = Log.read(record, simulator, judge, longest)
                 logs.append(log)
                 writer.write(log.rows.cells())
-                interrupt.begin()
                 if judge.goal is not None:
                     report(judge.distance, judge.goal)
                 else:
