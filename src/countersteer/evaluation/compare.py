@@ -367,7 +367,7 @@ def states_at(
     throttle_line, steering_line = (
         np.where(before >= 0, line[np.maximum(before, 0)], 0.0) for line in (throttle, steering)
     )
-    return State(motion, throttle_line, steering_line, zero, zero, zero, zero)
+    return State(motion, throttle_line, steering_line, *[zero] * 5)
 
 
 def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -410,7 +410,8 @@ def wheels_at(
         rims = [wheel.at(time) for wheel in measured.wheels]
     else:
         reference = find_references(measured).get("wheel_speed_mps")
-        rolls, _ = planar.contact_directions(car, steering)
+        steered = planar.Steered(*servo.directions(car.body, car.servo, steering))
+        rolls, _ = planar.contact_directions(car, steered)
         rims = [np.asarray(dot(roll, velocity)) for roll in rolls]
         if reference is not None:
             slip = reference.undone(time, resting) - np.mean(rims, axis=0)
