@@ -135,7 +135,7 @@ def parser() -> Parser:
     )
 
     take = verb("import", "other people's logs to run folders", run_import)
-    take.add_argument("format", choices=("dart",), metavar="FORMAT", help="dart")
+    take.add_argument("format", choices=("dart", "eth"), metavar="FORMAT", help="dart or eth")
     take.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a log")
     take.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder of the run folders"
@@ -320,10 +320,12 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) ->
 def run_import(options: argparse.Namespace) -> int:
     """`import`."""
     from countersteer.runs.dart import import_dart
+    from countersteer.runs.eth import import_eth
 
+    importer = {"dart": import_dart, "eth": import_eth}[options.format]
     results = []
     for file in options.files:
-        results.append(import_dart(file, options.out))
+        results.append(importer(file, options.out))
         if not options.json:
             print(f"{file.name} -> {options.out / file.stem}")
     if options.json:
