@@ -141,6 +141,33 @@ def parser() -> Parser:
         "--out", type=Path, required=True, metavar="DIR", help="folder of the run folders"
     )
 
+    trials = verb("trials", "commands for a series of drives", run_trials)
+    trials.add_argument(
+        "what",
+        choices=("throttle-steps",),
+        help="throttle-steps: from rest, straight, each a second at one throttle, then none",
+    )
+    trials.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the files"
+    )
+    trials.add_argument(
+        "--levels", metavar="LIST", help="throttles, such as 0.2,0.5 (default ten, 0.1 to 1)"
+    )
+    trials.add_argument(
+        "--duration-s",
+        type=number(0.01, 60),
+        default=1.0,
+        metavar="S",
+        help="at each throttle (default 1)",
+    )
+    trials.add_argument(
+        "--rate-hz",
+        type=number(1, 1000),
+        default=100.0,
+        metavar="HZ",
+        help="rows a second (default 100)",
+    )
+
     lists = verb("list", "what there is by name", run_list)
     lists.add_argument(
         "what",
@@ -330,6 +357,19 @@ def run_import(options: argparse.Namespace) -> int:
             print(f"{file.name} -> {options.out / file.stem}")
     if options.json:
         print(json.dumps({"runs": results}))
+    return DONE
+
+
+def run_trials(options: argparse.Namespace) -> int:
+    """`trials`."""
+    from countersteer.evaluation.trials import LEVELS, read_levels, throttle_steps
+
+    levels = LEVELS if options.levels is None else read_levels(options.levels)
+    result = throttle_steps(options.out, levels, options.duration_s, options.rate_hz)
+    if options.json:
+        print(json.dumps(result))
+    else:
+        print((options.out / "README.txt").read_text(), end="")
     return DONE
 
 

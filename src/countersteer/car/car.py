@@ -78,7 +78,9 @@ class MagicFormula:
     r_cy1: Scalar = parameter(1.0719, "1", 0, 3, "shape of the loss across", COMMONROAD)
     r_ey1: Scalar = parameter(-0.27572, "1", -50, 1, "curvature of the loss across", COMMONROAD)
     r_hy1: Scalar = parameter(5.7448e-6, "1", -0.2, 0.2, "its shift of slip ratio", COMMONROAD)
-    r_vy1: Scalar = parameter(-0.027825, "1", -1, 1, "force across that slip ratio makes", COMMONROAD)
+    r_vy1: Scalar = parameter(
+        -0.027825, "1", -1, 1, "force across that slip ratio makes", COMMONROAD
+    )
     r_vy4: Scalar = parameter(12.12, "1", -200, 200, "its fall with slip angle", COMMONROAD)
     r_vy5: Scalar = parameter(1.9, "1", -10, 10, "shape of that force", COMMONROAD)
     r_vy6: Scalar = parameter(-10.704, "1", -200, 200, "its steepness", COMMONROAD)
@@ -314,6 +316,20 @@ class Voltmeter:
 
 
 @pytree
+class LineDetector:
+    """An eye on the floor, which bears lines at a known spacing along the world's x axis."""
+
+    lines: str = choice(
+        "none",
+        ("none", "across-x"),
+        "none: no detector; across-x: lines across the world's x axis, one at x = 0",
+    )
+    spacing: Scalar = parameter(0.1, "m", 0.01, 100, "between the middles of two lines")
+    width: Scalar = parameter(0.01, "m", 0, 1, "of a line; it is reported when the eye enters it")
+    x: Scalar = parameter(0.0, "m", -5, 5, "of the eye, forward of the centre of mass")
+
+
+@pytree
 class Sensors:
     """What the car carries to sense with."""
 
@@ -322,6 +338,7 @@ class Sensors:
     gyroscope: Gyroscope = Gyroscope()
     accelerometer: Accelerometer = Accelerometer()
     voltmeter: Voltmeter = Voltmeter()
+    line_detector: LineDetector = LineDetector()
 
 
 @pytree
