@@ -75,7 +75,7 @@ def test_false_yaw_rates_are_empty_and_repeated_frames_left_out(tmp_path):
     assert about["repairs"]["yaw_rates_false"] == 2  # with the row behind it
     assert np.flatnonzero(np.isnan(truth["yaw_rate_radps"])).tolist() == [20, 21]
     assert about["rows"] == {"log": 60, "commands": 60, "truth": 59}
-    assert not np.any(np.isclose(truth["time_s"], 40 * PERIOD))
+    assert not np.any(np.isclose(truth["time_s"], 39 * PERIOD))
 
 
 BAD = {

@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "drivers": {"car", "course", "world", "estimation"},
     "simulator": {"car", "course", "world", "sensing", "link", "estimation", "drivers"},
     "runs": {"car", "course"},
+    "tuning": {"car", "course", "world", "sensing", "runs"},
     "evaluation": {
         "car", "course", "world", "sensing", "simulator", "runs",
     },

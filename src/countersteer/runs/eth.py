@@ -39,7 +39,8 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
 
     The files are `commands.csv` (a row each; throttle as logged, its sign the direction; steering
     times a nominal lock of 36 degrees), `truth.csv` (velocity turned into the body's axes, heading
-    unwrapped; rows that repeat the one before are left out, false yaw rates are empty), `run.toml`.
+    unwrapped; rows whose state the next one repeats are left out, false yaw rates are empty),
+    `run.toml`.
 
     Raises `InputError` with one line where the file is not an ETH log or is damaged.
     """
@@ -50,8 +51,10 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
     # The row after a wrap is still computed across it in part, if by less than is impossible.
     wrapped = np.abs(yaw_rate) > FASTEST_YAW
     wrapped[1:] |= wrapped[:-1].copy()
+    # Of two rows with one state the first stands a period early: the distance to the row before it
+    # is that of two periods, and that to the row behind them of one.
     repeated = np.zeros(len(time), bool)
-    repeated[1:] = np.all(np.diff(observed[:, :6], axis=0) == 0, axis=1)
+    repeated[:-1] = np.all(np.diff(observed[:, :6], axis=0) == 0, axis=1)
     truth = {
         "time_s": time,
         "x_m": x,
