@@ -8,21 +8,20 @@ import pytest
 
 from countersteer.car.files import load_car
 from countersteer.errors import InputError
-from countersteer.evaluation import compare as compare_module
-from countersteer.evaluation.compare import (
+from countersteer.evaluation.compare import compare, draw_comparison, sensed
+from countersteer.runs.dart import POINT_X, POINT_Y, import_dart
+from countersteer.runs.files import TRUTH, Table, TableWriter, command_rows, write_table
+from countersteer.runs.run import Run, read_run
+from countersteer.tuning import windows
+from countersteer.tuning.windows import (
+    ENCODER_QUANTUM,
     GYRO_LAG,
     Measured,
     Reference,
     Signal,
-    compare,
-    draw_comparison,
-    sensed,
     velocities,
     window_starts,
 )
-from countersteer.runs.dart import POINT_X, POINT_Y, import_dart
-from countersteer.runs.files import TRUTH, Table, TableWriter, command_rows, write_table
-from countersteer.runs.run import Run, read_run
 from countersteer.world import planar
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dart"
@@ -287,7 +286,7 @@ def test_another_car_is_told_apart(simulated, car, compared):
 
 
 def test_one_window_from_the_first_command_to_the_last(simulated, car, monkeypatch):
-    monkeypatch.setattr(compare_module, "SIZES", (32,))  # the program that is there already
+    monkeypatch.setattr(windows, "SIZES", (32,))  # the program that is there already
     result, _ = compare(simulated, car, None, 0.001)
     assert result["windows"] == 1
     assert result["horizon_s"] == pytest.approx(3.95)
@@ -361,5 +360,5 @@ def test_a_straight_step_is_compared_by_its_sensors(imported, car):
     result, series = compare(imported(STEP), car, 1.0, 0.001)
     assert list(result["rmse"]) == ["yaw_rate_radps", "wheel_speed_mps"]
     assert result["rmse"]["wheel_speed_mps"] < 1.0
-    steps = series["windows"][0]["wheel_speed_mps"].simulated / compare_module.ENCODER_QUANTUM
+    steps = series["windows"][0]["wheel_speed_mps"].simulated / ENCODER_QUANTUM
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)

@@ -21,11 +21,11 @@ MAY_IMPORT = {
     "drivers": {"car", "course", "world", "estimation"},
     "simulator": {"car", "course", "world", "sensing", "link", "estimation", "drivers"},
     "runs": {"car", "course"},
-    "tuning": {"car", "course", "world", "sensing", "runs"},
+    "tuning": {"car", "world", "sensing", "runs"},
     "evaluation": {
-        "car", "course", "world", "sensing", "simulator", "runs",
+        "car", "course", "world", "sensing", "simulator", "runs", "tuning",
     },
-    "viewing": {"runs", "simulator"},
+    "viewing": {"car", "runs", "simulator"},  # a car is drawn to its size
     "listing": {"car", "course"},
     "completion": {"car", "course"},
     "cli": None,

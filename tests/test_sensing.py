@@ -13,6 +13,8 @@ import pytest
 from conftest import start, varied
 from countersteer.car.car import Car, LineDetector, Mount, Sonar
 from countersteer.car.files import load_car
+from countersteer.course.course import place
+from countersteer.course.files import load_course
 from countersteer.sensing import parts, sonar, suite
 from countersteer.world.state import Motion
 
@@ -454,3 +456,37 @@ def test_without_lines_the_detector_is_not_there(listen: Callable) -> None:
     told = listen(RX7)
     assert told.line_crossings is told.line_speed is None
     assert suite.initial_memory(RX7, start(RX7, 4).motion).eye is None
+
+
+@pytest.mark.parametrize("name", ["box", "ess"])
+def test_the_nearest_walls_in_the_cone_are_all_that_a_ping_needs(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course, seed = load_course(name), 5
+    walls = []
+    for a, b in zip(course.walls[:, :2], course.walls[:, 2:], strict=True):
+        count = math.ceil(np.hypot(*(b - a)) / 0.9)
+        cuts = a + (b - a) * np.linspace(0, 1, count + 1)[:, None]
+        walls.append(np.hstack([cuts[:-1], cuts[1:]]))
+    around = np.full((64, 4), np.nan)
+    around[: sum(map(len, walls))] = np.concatenate(walls)
+    around, corners = jnp.asarray(around), jnp.asarray(sonar.edges(around))
+    rng = np.random.default_rng(seed)
+    places = [place(course, d) for d in rng.uniform(0, course.length, 40)]
+    spread = rng.uniform([-0.5, -0.5, -4], [0.5, 0.5, 4], (40, 3))
+    poses, keys = np.array(places) + spread, jax.random.split(jax.random.key(seed), 40)
+    part = dataclasses.replace(RX7.sensors.sonar, edge_echo=np.float64(0.3))
+
+    def heard(most: int) -> np.ndarray:
+        monkeypatch.setattr(sonar, "MOST_WALLS", most)
+
+        def one(scene: tuple) -> jax.Array:
+            pose, key = scene
+            told = sonar.distances(part, around, corners, tuple(pose), (1.0, 1.0, 1.0), key)
+            return jnp.stack(told)
+
+        return np.asarray(jax.jit(lambda scenes: jax.lax.map(one, scenes))((poses, keys)))
+
+    few, all_of_them = heard(24), heard(64)
+    assert np.isfinite(few).mean() > 0.5
+    assert np.array_equal(few, all_of_them)

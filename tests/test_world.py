@@ -238,7 +238,7 @@ def test_a_car_at_rest_stays_at_rest_below_the_dead_zone(drive: Callable) -> Non
 def _far(args: tuple, walls: jax.Array, weights: jax.Array) -> jax.Array:
     car, motion, throttle, steering = args
     line, zero = jnp.zeros(16), jnp.zeros(())
-    state = planar.State(motion, line, line, zero, zero, zero, zero)
+    state = planar.State(motion, line, line, *[zero] * 5)
 
     def tick(state: planar.State, inputs: tuple) -> tuple:
         count, *command = inputs

@@ -174,6 +174,14 @@ class Motor:
     current_limit: Scalar = parameter(60.0, "A", 0.1, 2000, "of the speed controller")
     dead_zone: Scalar = parameter(0.05, "1", 0, 0.9, "throttle below which nothing is driven")
     full_throttle: Scalar = parameter(1.0, "1", 0.1, 1, "throttle from which the duty is full")
+    conduction: Scalar = parameter(
+        1.0,
+        "1",
+        0,
+        1,
+        "part of the controller's pause through which current flows on: 1 all of it, as with a "
+        "high inductance or a fast controller; 0 it dies at once",
+    )
     overrun: Scalar = parameter(
         0.0, "1", 0, 1, "part of the braking current that flows when the car outruns its throttle"
     )

@@ -32,10 +32,10 @@ def library() -> list[str]:
     return sorted(p.name.removesuffix(".toml") for p in LIBRARY.iterdir() if p.suffix == ".toml")  # type: ignore[attr-defined]  # resources here are paths
 
 
-def read_toml(name: str, shelf: Any, kind: str) -> tuple[dict[str, Any], str]:
+def read_toml(name: str, shelf: Any, kind: str, files: str = ".toml") -> tuple[dict[str, Any], str]:
     """The tables of a library entry or of a file's path, and what to call them in messages.
 
-    Raises `InputError` where there is none, or where it is no TOML.
+    Raises `InputError` where there is none, or where it is no TOML; it says which `files` may be.
     """
     entry = shelf / f"{name}.toml"
     path = Path(name)
@@ -47,7 +47,7 @@ def read_toml(name: str, shelf: Any, kind: str) -> tuple[dict[str, Any], str]:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{name}: not valid TOML: {error}") from None
     known = ", ".join(sorted(p.name.removesuffix(".toml") for p in shelf.iterdir()))
-    raise InputError(f"no {kind} {name}: give one of {known}, or the path of a .toml file")
+    raise InputError(f"no {kind} {name}: give one of {known}, or the path of a {files} file")
 
 
 def load_car(name: str, overrides: Iterable[str] = ()) -> Car:

@@ -2,14 +2,18 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from countersteer.car.car import GRAVITY, Car
 from countersteer.errors import InputError
 
+if TYPE_CHECKING:
+    from shapely import Polygon
+
 ARC_STEP = math.radians(5)  # of the chords that stand for a rounded corner
+MOST_WALLS = 8192
 
 
 class Turn(NamedTuple):
@@ -24,7 +28,7 @@ class Course:
     """Immutable; distances are along the centre line, in metres. Angles in rad."""
 
     name: str
-    width: float | None  # None where there are only free walls
+    width: float | None  # the least one; None where there are only free walls
     closed: bool
     line: (
         np.ndarray
@@ -34,6 +38,8 @@ class Course:
     start: tuple[float, float, float]  # x, y, heading
     start_distance: float
     goal_distance: float | None  # None: nothing to reach
+    # (n, 2) room to the right and left of each point of the line; None: half the width each
+    sides: np.ndarray | None = None
 
     @property
     def length(self) -> float:
@@ -121,6 +127,26 @@ def from_walls(
 ) -> Course:
     """Free walls; `start` is x, y, heading."""
     return Course(name, None, False, np.zeros((0, 2)), walls, (), start, 0.0, None)
+
+
+def from_track(name: str, line: np.ndarray, sides: np.ndarray, walls: np.ndarray) -> Course:
+    """A closed course along any line, starting at its first point; the goal is a lap later.
+
+    `line` (n, 2) and `sides` (n, 2) go round once, without the first point again.
+    """
+    line, sides = np.vstack([line, line[:1]]), np.vstack([sides, sides[:1]])
+    width = float(np.min(np.sum(sides, axis=1)))
+    course = Course(name, width, True, line, walls, (), (0.0, 0.0, 0.0), 0.0, None, sides)
+    return dataclasses.replace(course, start=place(course, 0.0), goal_distance=course.length)
+
+
+def walls_around(area: "Polygon", where: str) -> np.ndarray:
+    """The boundary of an area and of its holes as wall segments; `InputError` if too many."""
+    rings = [np.asarray(ring.coords) for ring in (area.exterior, *area.interiors)]
+    walls = np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in rings])
+    if len(walls) > MOST_WALLS:
+        raise InputError(f"{where}: {len(walls)} pieces of wall, over {MOST_WALLS}")
+    return walls
 
 
 def _rounded(

@@ -1,9 +1,10 @@
-"""Courses in TOML files."""
+"""Courses in files: TOML here; centre lines and maps by the files beside this one."""
 
 import dataclasses
 import importlib.resources
 import itertools
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,21 @@ def library() -> list[str]:
 
 
 def load_course(name: str) -> Course:
-    """A course from the library or a file. Raises `InputError` naming file and key."""
-    tables, where = read_toml(name, LIBRARY, "course")
+    """A course from the library or a file. Raises `InputError` naming file and key.
+
+    A `.csv` is a centre line with widths (F1TENTH), a `.yaml` an occupancy map (ROS).
+    """
+    path = Path(name)
+    # Imported here, as geometry and pictures take their time to load.
+    if path.suffix == ".csv":
+        from countersteer.course.centre_line import read_centre_line
+
+        return read_centre_line(path)
+    if path.suffix in (".yaml", ".yml"):
+        from countersteer.course.occupancy_map import read_map
+
+        return read_map(path)
+    tables, where = read_toml(name, LIBRARY, "course", ".toml, .csv or .yaml")
     return course_from_tables(tables, where)
 
 
@@ -126,6 +140,8 @@ def course_tables(course: Course) -> dict[str, Any]:
         tables["width_m"] = course.width
     if course.goal_distance is not None:
         tables["goal_distance_m"] = course.goal_distance
+    if course.sides is not None:
+        tables["sides_m"] = course.sides.tolist()
     return tables
 
 
@@ -148,6 +164,7 @@ def course_of_run(about: dict[str, Any]) -> Course | None:
             start=(float(start["x_m"]), float(start["y_m"]), float(start["heading_rad"])),
             start_distance=float(tables["start_distance_m"]),
             goal_distance=tables.get("goal_distance_m"),
+            sides=np.array(tables["sides_m"], float) if "sides_m" in tables else None,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"run.toml: [course] is not as it was written: {error}") from None

@@ -14,6 +14,7 @@ from countersteer.course.course import Course
 from countersteer.drivers import straighten
 from countersteer.drivers.driver import Command, Observation
 from countersteer.drivers.straighten import Straighten
+from countersteer.errors import InputError
 
 STRAIGHT, SPIN, CATCH = 0, 1, 2
 SPEED = 2.02  # m/s, unless another is asked for
@@ -136,8 +137,16 @@ class DriftTurn:
 
 
 def drift_turn(course: Course, car: Car, speed: float | None = None, laps: int = 1) -> DriftTurn:
-    """For a course and a nominal car; `speed` (m/s) is what it brings to a turn."""
+    """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
+
+    Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
+    """
     turns = course.turns_ahead(laps)
+    if course.closed and not turns:
+        raise InputError(
+            f"{course.name}: drift-turn needs straights with corners between them; "
+            "examples/grip_limit.py laps a course without"
+        )
     marks = [course.start_distance] + [t.distance for t in turns]
     sonar = car.sensors.sonar
     front = straighten.mount_number(car, "front")

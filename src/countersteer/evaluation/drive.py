@@ -17,7 +17,7 @@ from countersteer.car.car import wheel_positions
 from countersteer.car.files import car_tables
 from countersteer.course.files import course_tables
 from countersteer.evaluation.turns import Judge, going_straight, sideslip, summary
-from countersteer.runs.files import TRUTH
+from countersteer.runs.files import COMMANDS, TRUTH
 from countersteer.runs.writer import WHEELS, Rows, RunWriter
 from countersteer.simulator import Record, Simulator
 
@@ -281,13 +281,14 @@ def drive(
     judge = Judge(simulator.course, laps)
     logs: list[Log] = []
     status = "out of time"
-    with RunWriter(folder, about, telemetry_header(simulator)) as writer:
+    headers = {"commands": COMMANDS, "telemetry": telemetry_header(simulator), "truth": TRUTH}
+    with RunWriter(folder, about, headers) as writer:
         with Interrupt() as interrupt, contextlib.closing(simulator.run(longest)) as pieces:
             for record in pieces:
+                interrupt.begin()
                 log, end = Log.read(record, simulator, judge, longest)
                 logs.append(log)
-                writer.write(log.rows)
-                interrupt.begin()
+                writer.write(log.rows.cells())
                 if judge.goal is not None:
                     report(judge.distance, judge.goal)
                 else:

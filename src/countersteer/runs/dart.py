@@ -15,18 +15,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tomli_w
 
 from countersteer.errors import InputError
 from countersteer.runs.files import (
     COMMANDS,
     Table,
-    TableWriter,
+    column_rows,
     command_rows,
     read_table,
-    write_table,
 )
-from countersteer.runs.writer import new_folder
+from countersteer.runs.writer import RunWriter, new_folder
 
 FULL_LOCK = 25.0  # degrees of the front wheels that a steering of 1 nominally asks for
 
@@ -120,14 +118,17 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
             else "at the centre of mass in the file itself"
         )
     folder = new_folder(out / log.stem, log.stem)
-    (folder / "run.toml").write_text(tomli_w.dumps(about))
-    writer = TableWriter(folder / "commands.csv", COMMANDS)
     steering = np.radians(FULL_LOCK * updates["steering"])
-    writer.write(command_rows(updates["time_s"], throttle, steering))
-    writer.close()
-    write_table(folder / "telemetry.csv", telemetry)
+    headers = {"commands": COMMANDS, "telemetry": tuple(telemetry)}
+    cells = {
+        "commands": command_rows(updates["time_s"], throttle, steering),
+        "telemetry": column_rows(telemetry.values()),
+    }
     if found.truth is not None:
-        write_table(folder / "truth.csv", found.truth)
+        headers["truth"] = tuple(found.truth)
+        cells["truth"] = column_rows(found.truth.values())
+    with RunWriter(folder, about, headers) as writer:
+        writer.write(cells)
     return {"run": str(folder), "duration_s": float(updates["time_s"][-1]), **about}
 
 

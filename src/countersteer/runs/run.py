@@ -2,13 +2,14 @@
 
 import dataclasses
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.files import car_from_tables
+from countersteer.car.files import car_from_tables, library, load_car
 from countersteer.errors import InputError
 from countersteer.runs.files import Table, read_commands, read_table
 from countersteer.text import read_text
@@ -37,6 +38,17 @@ class Run:
         """(n, 4) ends of the course's walls, m."""
         walls = self.about.get("course", {}).get("walls_m", [])
         return np.array(walls, float).reshape(-1, 4)
+
+
+def drawn_car(about: Mapping[str, Any]) -> Car:
+    """The car to draw for a `run.toml`: its own in full, else the library's of that name or rx7.
+
+    What is drawn needs a size; nothing is computed with a car that is only like the real one.
+    """
+    if isinstance(about.get("car"), dict):
+        return car_from_tables(about["car"], "run.toml")
+    name = about.get("car_name")
+    return load_car(name if name in library() else "rx7")
 
 
 def read_run(path: Path) -> Run:

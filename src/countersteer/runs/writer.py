@@ -4,13 +4,14 @@ import itertools
 import json
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import tomli_w
 
 from countersteer.errors import InputError
-from countersteer.runs.files import COMMANDS, TRUTH, TableWriter, column_rows, command_rows
+from countersteer.runs.files import TableWriter, column_rows, command_rows
+from countersteer.runs.mcap import McapWriter
 
 WHEELS = ("fl", "fr", "rl", "rr")
 
@@ -21,6 +22,14 @@ class Rows(NamedTuple):
     commands: tuple[np.ndarray, np.ndarray, np.ndarray]  # time, throttle, steering
     telemetry: tuple[np.ndarray, ...]  # in the order of the header given; NaN: nothing new
     truth: tuple[np.ndarray, ...]  # in the order of `TRUTH`
+
+    def cells(self) -> dict[str, list[list[str]]]:
+        """The same as rows of text by table."""
+        return {
+            "commands": command_rows(*self.commands),
+            "telemetry": column_rows(self.telemetry),
+            "truth": column_rows(self.truth),
+        }
 
 
 def new_folder(out: Path | None, name: str) -> Path:
@@ -58,27 +67,33 @@ def _numbered(parent: Path, name: str) -> Path:
 
 
 class RunWriter:
-    """A folder with `run.toml` and three tables that grow; flushed with every piece."""
+    """A folder with `run.toml`, tables that grow, and `run.mcap`; flushed with every piece."""
 
-    def __init__(self, folder: Path, about: dict[str, Any], telemetry: tuple[str, ...]) -> None:
-        """Writes `run.toml` and the headers."""
+    def __init__(
+        self, folder: Path, about: dict[str, Any], headers: dict[str, tuple[str, ...]]
+    ) -> None:
+        """Writes `run.toml` and the headers, by the tables' names."""
         self.folder = folder
-        (folder / "run.toml").write_text(tomli_w.dumps(about))
-        self._commands = TableWriter(folder / "commands.csv", COMMANDS)
-        self._telemetry = TableWriter(folder / "telemetry.csv", telemetry)
-        self._truth = TableWriter(folder / "truth.csv", TRUTH)
+        text = tomli_w.dumps(about)
+        (folder / "run.toml").write_text(text)
+        self._tables = {
+            name: TableWriter(folder / f"{name}.csv", header) for name, header in headers.items()
+        }
+        self._mcap = McapWriter(folder / "run.mcap", about, text, headers)
+        self._summary: dict[str, Any] | None = None
 
-    def write(self, rows: Rows) -> None:
-        """Appends a piece."""
-        self._commands.write(command_rows(*rows.commands))
-        self._telemetry.write(column_rows(rows.telemetry))
-        self._truth.write(column_rows(rows.truth))
+    def write(self, cells: dict[str, list[list[str]]]) -> None:
+        """Appends a piece: rows by table."""
+        for name, table in self._tables.items():
+            table.write(cells[name])
+        self._mcap.write(cells)
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Writes `summary.json`."""
+        self._summary = summary
         (self.folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
 
-    def __enter__(self) -> "RunWriter":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -87,5 +102,6 @@ class RunWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for table in (self._commands, self._telemetry, self._truth):
+        for table in self._tables.values():
             table.close()
+        self._mcap.close(self._summary)

@@ -5,12 +5,14 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
 from countersteer.car.car import Sonar
 from countersteer.car.parameter import Scalar
 
 PAST = 1e-5  # rad by which a ray passes the end of a wall
 MERGED = 1e-4  # m within which ends of walls are one corner
+MOST_WALLS = 24  # that a ping reckons with: in its cone, the nearest ones
 
 
 def edges(walls: np.ndarray) -> np.ndarray:
@@ -22,9 +24,12 @@ def edges(walls: np.ndarray) -> np.ndarray:
     ends = np.concatenate([walls[:, :2], walls[:, 2:]])
     along = np.concatenate([walls[:, 2:], walls[:, :2]]) - ends
     along = along / np.sqrt(np.sum(along**2, axis=1, keepdims=True) + 1e-18)
-    same = np.sum((ends[:, None] - ends[None]) ** 2, axis=-1) < MERGED**2
-    straight = np.sum(along[:, None] * along[None], axis=-1) < -0.999
-    scatters = ~np.any(same & straight, axis=1)
+    scatters = np.ones(len(ends), bool)
+    real = np.nonzero(np.all(np.isfinite(ends), axis=1))[0]
+    if len(real):
+        one, other = real[KDTree(ends[real]).query_pairs(MERGED, output_type="ndarray")].T
+        seams = np.sum(along[one] * along[other], axis=1) < -0.999
+        scatters[one[seams]] = scatters[other[seams]] = False
     return np.concatenate([ends, scatters[:, None]], axis=1).astype(walls.dtype)
 
 
@@ -43,6 +48,9 @@ def distances(
     `corners` (from `edges`) echo by chance each ping. Whatever a wall hides returns nothing (walls
     are taken to meet at their ends, if at all). A mount that pings together with others also hears
     their echoes, at half the way out and back, if they come from within `hearing`.
+
+    A ping reckons with the `MOST_WALLS` nearest walls that may reach into its cone: with all of
+    them, unless there are more within `reach`.
     """
     x, y, bearing = (jnp.stack(values) for values in zip(*_spots(sonar, pose), strict=True))
     edge_key, noise_key = jax.random.split(key)
@@ -90,6 +98,10 @@ def _echo(
     bearing: Scalar,
 ) -> tuple[Scalar, Scalar, Scalar]:
     """Distance and place of the nearest echo of one mount; `lit` is 1 for corners that echo."""
+    if walls.shape[0] > MOST_WALLS:
+        near = _nearest(sonar, walls, x, y, bearing)
+        both = jnp.concatenate([near, near + walls.shape[0]])
+        walls, corners, lit = walls[near], corners[both], lit[both]
     start, end = walls[:, :2] - jnp.stack([x, y]), walls[:, 2:] - jnp.stack([x, y])
     length = jnp.sqrt(jnp.sum((end - start) ** 2, axis=1) + 1e-18)
     along = (end - start) / length[:, None]
@@ -132,6 +144,25 @@ def _echo(
     reach = jnp.where(seen, reach, jnp.inf)
     nearest = jnp.argmin(reach)
     return reach[nearest], x + points[nearest, 0], y + points[nearest, 1]
+
+
+def _nearest(sonar: Sonar, walls: jax.Array, x: Scalar, y: Scalar, bearing: Scalar) -> jax.Array:
+    """Which `MOST_WALLS` walls come nearest, of those not all to one side of the cone; in order."""
+    start, end = walls[:, :2] - jnp.stack([x, y]), walls[:, 2:] - jnp.stack([x, y])
+    step = end - start
+    at = -jnp.sum(start * step, axis=1) / (jnp.sum(step**2, axis=1) + 1e-18)
+    away = jnp.sum((start + jnp.clip(at, 0.0, 1.0)[:, None] * step) ** 2, axis=1)
+    inside = ~jnp.isnan(away)  # padding
+    slope = jnp.tan(sonar.half_angle)
+    cosine, sine = jnp.cos(bearing), jnp.sin(bearing)
+    for side in (1.0, -1.0):
+        within = [
+            slope * (cosine * p[:, 0] + sine * p[:, 1]) + side * (cosine * p[:, 1] - sine * p[:, 0])
+            for p in (start, end)
+        ]
+        # A little beyond the cone, as rays pass the ends of walls.
+        inside = inside & (jnp.maximum(*within) > -0.01)
+    return jnp.sort(jax.lax.top_k(jnp.where(inside, -away, -jnp.inf), MOST_WALLS)[1])
 
 
 def _left(vector: jax.Array) -> jax.Array:

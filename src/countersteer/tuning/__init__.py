@@ -1,1 +1,1 @@
-"""Logs in, a car out."""
+"""Logs to cars: windows of logs, the simulated car over them, and the fit of one to the other."""

@@ -21,14 +21,14 @@ Rectangle = tuple[float, float, float, float]  # left, bottom, width, height; pa
 
 _SIZE_IN = (14.0, 9.0)
 _DPI = 100
-_PAPER, _FLOOR, _INK, _SOFT, _LINE = "#fffefb", "#fbfaf6", "#1b2229", "#5a6570", "#e2ded3"
-_WALL, _GLASS, _TURN, _SPEED = "#39434c", "#303a43", "#f3eee1", "#0069a8"
+PAPER, FLOOR, INK, SOFT, LINE = "#fffefb", "#fbfaf6", "#1b2229", "#5a6570", "#e2ded3"
+WALL, GLASS, _TURN, SPEED = "#39434c", "#303a43", "#f3eee1", "#0069a8"
 _GOOD, _BAD = "#00694f", "#a3210f"
 # From calm to wild. The lightness falls all the way, so the order needs no red and green.
-_SLIP_COLOURS = ("#a9bac7", "#e39a2b", "#a3210f")
+SLIP_COLOURS = ("#a9bac7", "#e39a2b", "#a3210f")
 
-_SKID_FROM_MPS, _SKID_FULL_MPS = 0.3, 2.0
-_SKID_FAINTEST, _SKID_DARKEST = 0.12, 0.42
+SKID_FROM_MPS, SKID_FULL_MPS = 0.3, 2.0
+_SKID_FAINTEST, SKID_DARKEST = 0.12, 0.42
 _MOST_SKID_SAMPLES = 2000
 
 # Outlines in halves of the car's length and width, from the centre of the outline.
@@ -36,9 +36,9 @@ _LEFT_OF_BODY = [
     *((-1.0, 0.3), (-0.98, 0.7), (-0.92, 0.92), (-0.8, 1.0), (-0.5, 0.96), (-0.2, 0.93)),
     *((0.2, 0.93), (0.62, 0.96), (0.82, 0.88), (0.94, 0.66), (1.0, 0.3)),
 ]
-_BODY = np.array(_LEFT_OF_BODY + [(u, -v) for u, v in reversed(_LEFT_OF_BODY)])
-_WINDSCREEN = np.array([(0.3, 0.6), (0.36, 0), (0.3, -0.6), (0.06, -0.5), (0.09, 0), (0.06, 0.5)])
-_REAR_WINDOW = np.array([(-0.6, 0.56), (-0.62, 0), (-0.6, -0.56), (-0.42, -0.46), (-0.42, 0.46)])
+BODY = np.array(_LEFT_OF_BODY + [(u, -v) for u, v in reversed(_LEFT_OF_BODY)])
+WINDSCREEN = np.array([(0.3, 0.6), (0.36, 0), (0.3, -0.6), (0.06, -0.5), (0.09, 0), (0.06, 0.5)])
+REAR_WINDOW = np.array([(-0.6, 0.56), (-0.62, 0), (-0.6, -0.56), (-0.42, -0.46), (-0.42, 0.46)])
 
 _GHOST_EVERY_S, _GHOST_EVERY_IN_TURN_S, _MOST_GHOSTS = 0.25, 0.15, 160
 # Ghosts that hide each other show nothing. These are the least distances, in car lengths, from a
@@ -74,11 +74,11 @@ def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor=_PAPER)
+    figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor=PAPER)
     canvas = FigureCanvasAgg(figure)
     low, high = _bounds(view)
     layout = _BELOW if high[0] - low[0] > _LONG * (high[1] - low[1]) else _BESIDE
-    colours = LinearSegmentedColormap.from_list("sideslip", _SLIP_COLOURS)
+    colours = LinearSegmentedColormap.from_list("sideslip", SLIP_COLOURS)
     largest = float(np.max(np.abs(view["sideslip_deg"])))
     colours_end = max(20, 5 * math.ceil(largest / 5))
 
@@ -103,7 +103,7 @@ def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: fl
     """Write across the top what was driven and how it ended."""
     summary = view["summary"]
     status = str(summary["status"])
-    figure.text(0.022, 0.955, str(view["title"]), color=_INK, size=18, weight="bold", va="center")
+    figure.text(0.022, 0.955, str(view["title"]), color=INK, size=18, weight="bold", va="center")
     said = status[:1].upper() + status[1:]
     mood = _GOOD if summary["completed"] else _BAD
     figure.text(0.022, 0.914, said, color=mood, size=13, weight="bold", va="center")
@@ -116,9 +116,9 @@ def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: fl
         ("largest sideslip", f"{largest_sideslip:.0f}°"),
     )
     for right, (name, value) in zip((0.718, 0.845, 0.978), facts, strict=True):
-        bold = figure.text(right, 0.955, value, color=_INK, size=17, va="center", ha="right")
+        bold = figure.text(right, 0.955, value, color=INK, size=17, va="center", ha="right")
         bold.set_fontweight("bold")
-        figure.text(right, 0.916, name, color=_SOFT, size=10.5, va="center", ha="right")
+        figure.text(right, 0.916, name, color=SOFT, size=10.5, va="center", ha="right")
 
 
 # -------------------------------------------------------------------------------------------------
@@ -136,9 +136,9 @@ def _draw_floor(
     """Draw the drive from above and return how many metres wide the whole figure would be."""
     from matplotlib.collections import LineCollection
 
-    axes = figure.add_axes(place, facecolor=_FLOOR, xticks=[], yticks=[])
+    axes = figure.add_axes(place, facecolor=FLOOR, xticks=[], yticks=[])
     for side in axes.spines.values():
-        side.set_color(_LINE)
+        side.set_color(LINE)
     # One scale for both axes: the limits are widened to the shape of the place.
     low, high = _bounds(view)
     inches = np.array([place[2] * _SIZE_IN[0], place[3] * _SIZE_IN[1]])
@@ -148,11 +148,11 @@ def _draw_floor(
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
 
     _draw_skid_marks(axes, view, 72 / metres_per_inch)
-    axes.plot(view["x_m"], view["y_m"], color=_SOFT, linewidth=0.8, alpha=0.6, zorder=2)
+    axes.plot(view["x_m"], view["y_m"], color=SOFT, linewidth=0.8, alpha=0.6, zorder=2)
     _draw_ghosts(axes, view, colours, colours_end)
     walls = np.array(view["walls_m"], dtype=float).reshape(-1, 2, 2)
     axes.add_collection(
-        LineCollection(list(walls), colors=_WALL, linewidths=3.5, capstyle="round", zorder=4),
+        LineCollection(list(walls), colors=WALL, linewidths=3.5, capstyle="round", zorder=4),
         autolim=False,
     )
     _number_turns(axes, view)
@@ -166,12 +166,12 @@ def _draw_skid_marks(axes: "Axes", view: dict[str, Any], points_per_metre: float
     stride = math.ceil(len(view["time_s"]) / _MOST_SKID_SAMPLES)
     poses = _poses(view)[::stride]
     for wheel, series in zip(view["car"]["wheels"], view["wheels"], strict=False):
-        track = _placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
+        track = placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
         slip = np.array(series["slip_mps"][::stride])[:-1]
-        marks = slip > _SKID_FROM_MPS
-        share = np.clip((slip[marks] - _SKID_FROM_MPS) / (_SKID_FULL_MPS - _SKID_FROM_MPS), 0, 1)
+        marks = slip > SKID_FROM_MPS
+        share = np.clip((slip[marks] - SKID_FROM_MPS) / (SKID_FULL_MPS - SKID_FROM_MPS), 0, 1)
         shades = np.zeros((len(share), 4))
-        shades[:, 3] = _SKID_FAINTEST + (_SKID_DARKEST - _SKID_FAINTEST) * share
+        shades[:, 3] = _SKID_FAINTEST + (SKID_DARKEST - _SKID_FAINTEST) * share
         axes.add_collection(
             LineCollection(
                 list(np.stack([track[:-1], track[1:]], axis=1)[marks]),
@@ -197,7 +197,7 @@ def _draw_ghosts(
     centre = np.array([car["center_x_m"], 0.0])
     paints = colours(np.abs(np.array(view["sideslip_deg"])[chosen]) / colours_end)
     body, windscreen, rear_window = (
-        _placed(shape * half + centre, poses) for shape in (_BODY, _WINDSCREEN, _REAR_WINDOW)
+        placed(shape * half + centre, poses) for shape in (BODY, WINDSCREEN, REAR_WINDOW)
     )
     wheels = [_placed_wheel(view, k, chosen, poses) for k in range(len(car["wheels"]))]
     shapes: list[Array] = []
@@ -205,8 +205,8 @@ def _draw_ghosts(
     # All in one collection, because what belongs to one car has to lie together in depth.
     for k, paint in enumerate(paints):
         shapes += [body[k], windscreen[k], rear_window[k], *(wheel[k] for wheel in wheels)]
-        faces += [paint, _GLASS, _GLASS, *(_INK for _ in wheels)]
-    edges = [_PAPER, "none", "none", *("none" for _ in wheels)] * len(paints)
+        faces += [paint, GLASS, GLASS, *(INK for _ in wheels)]
+    edges = [PAPER, "none", "none", *("none" for _ in wheels)] * len(paints)
     axes.add_collection(
         PolyCollection(
             shapes, facecolors=faces, edgecolors=edges, linewidths=1.1, zorder=3, joinstyle="round"
@@ -260,7 +260,7 @@ def _number_turns(axes: "Axes", view: dict[str, Any]) -> None:
         if norm == 0:
             continue
         x, y = points[1] + inward / norm * 1.1 * view["car"]["length_m"]
-        text = axes.text(x, y, str(number), color=_SOFT, size=15, ha="center", va="center")
+        text = axes.text(x, y, str(number), color=SOFT, size=15, ha="center", va="center")
         text.set(weight="bold", zorder=5)
 
 
@@ -269,7 +269,7 @@ def _poses(view: dict[str, Any]) -> Array:
     return np.column_stack([view["x_m"], view["y_m"], view["heading_rad"]])
 
 
-def _placed(points: Array, poses: Array) -> Array:
+def placed(points: Array, poses: Array) -> Array:
     """Return where `points` of the car (a row each) are on the floor for each pose."""
     cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
     x, y = points[:, 0], points[:, 1]
@@ -287,10 +287,10 @@ def _placed_wheel(
         angle = np.radians(np.array(view["steering_deg"])[chosen])
     else:
         angle = np.zeros(len(chosen))
-    hub = _placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
+    hub = placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
     radius, half_width = wheel["radius_m"], wheel["width_m"] / 2
     tread = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (radius, half_width)
-    return _placed(tread, np.column_stack([hub, poses[:, 2] + angle]))
+    return placed(tread, np.column_stack([hub, poses[:, 2] + angle]))
 
 
 def _draw_keys(
@@ -303,18 +303,18 @@ def _draw_keys(
     """Draw what the colours mean and how long a metre is, under the floor."""
     left, bottom, width, _ = floor
     y, right = bottom - 0.027, left + width
-    figure.text(left, y, "sideslip  0°", color=_SOFT, size=10.5, va="center")
+    figure.text(left, y, "sideslip  0°", color=SOFT, size=10.5, va="center")
     _paint_ramp(figure, colours, (left + 0.068, y - 0.006, 0.1, 0.012))
-    figure.text(left + 0.174, y, f"{colours_end}°", color=_SOFT, size=10.5, va="center")
-    metres = _nice_step(0.05 * metres_per_width)
+    figure.text(left + 0.174, y, f"{colours_end}°", color=SOFT, size=10.5, va="center")
+    metres = nice_step(0.05 * metres_per_width)
     start = right - metres / metres_per_width
     _draw_line(
         figure,
         [(start, y + 0.007), (start, y - 0.007), (right, y - 0.007), (right, y + 0.007)],
-        colour=_SOFT,
+        colour=SOFT,
         width=1.4,
     )
-    label = figure.text(start - 0.008, y, f"{metres:g} m", color=_SOFT, size=10.5, va="center")
+    label = figure.text(start - 0.008, y, f"{metres:g} m", color=SOFT, size=10.5, va="center")
     label.set_horizontalalignment("right")
 
 
@@ -362,11 +362,11 @@ class _Strip(NamedTuple):
 def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> None:
     """Draw what was measured over time, one strip under the other."""
     strips = (
-        _Strip("Speed", "m/s", view["speed_mps"], _SPEED),
+        _Strip("Speed", "m/s", view["speed_mps"], SPEED),
         _Strip("Sideslip", "°", view["sideslip_deg"], "#c97a10"),
-        _Strip("Yaw rate", "°/s", view["yaw_rate_degps"], _SOFT),
-        _Strip("Steering", "°", view["steering_deg"], _SOFT, view["steering_command_deg"]),
-        _Strip("Throttle", "%", [100 * part for part in view["throttle"]], _SOFT),
+        _Strip("Yaw rate", "°/s", view["yaw_rate_degps"], SOFT),
+        _Strip("Steering", "°", view["steering_deg"], SOFT, view["steering_command_deg"]),
+        _Strip("Throttle", "%", [100 * part for part in view["throttle"]], SOFT),
     )
     left, bottom, width, height = place
     pitch = height / len(strips)
@@ -390,19 +390,19 @@ def _draw_strip(axes: "Axes", strip: _Strip, view: dict[str, Any], is_last: bool
     axes.fill_between(time, strip.values, color=strip.colour, alpha=0.12, linewidth=0, zorder=2)
     axes.plot(time, strip.values, color=strip.colour, linewidth=1.5, zorder=3)
     if strip.command is not None:
-        axes.plot(time, strip.command, color=_INK, linewidth=0.8, dashes=_DASHES, zorder=3)
+        axes.plot(time, strip.command, color=INK, linewidth=0.8, dashes=_DASHES, zorder=3)
     axes.set_xlim(time[0], max(time[-1], time[0] + 1e-3))
     axes.set_ylim(low - 0.06 * span, high + 0.06 * span)
     axes.set_yticks(_ticks(low, high, span / 2.6))
     axes.set_xticks(_ticks(time[0], time[-1], (time[-1] - time[0]) / 8 or 1))
-    axes.grid(axis="y", color=_LINE, linewidth=0.8, zorder=1)
+    axes.grid(axis="y", color=LINE, linewidth=0.8, zorder=1)
     axes.set_axisbelow(True)
     axes.set_frame_on(False)
     axes.tick_params(
-        length=0, labelsize=9.5, labelcolor=_SOFT, pad=5, labelbottom=is_last, bottom=is_last
+        length=0, labelsize=9.5, labelcolor=SOFT, pad=5, labelbottom=is_last, bottom=is_last
     )
     if is_last:
-        axes.set_xlabel("time, s", color=_SOFT, size=9.5, labelpad=3, loc="right")
+        axes.set_xlabel("time, s", color=SOFT, size=9.5, labelpad=3, loc="right")
 
 
 def _write_caption(
@@ -410,18 +410,18 @@ def _write_caption(
 ) -> None:
     """Write the strip's name at `start` and, where it has two curves, the key at the other end."""
     x, y = start
-    name = figure.text(x, y, f"{strip.name}, {strip.unit}", color=_INK, size=10.5, va="center")
+    name = figure.text(x, y, f"{strip.name}, {strip.unit}", color=INK, size=10.5, va="center")
     name.set_fontweight("bold")
     if strip.command is None:
         return
     right = x + width
     _draw_line(figure, [(right - 0.145, y), (right - 0.13, y)], strip.colour, 1.8)
-    figure.text(right - 0.125, y, "actual", color=_SOFT, size=9.5, va="center")
-    _draw_line(figure, [(right - 0.075, y), (right - 0.057, y)], _INK, 0.9, _DASHES)
-    figure.text(right, y, "command", color=_SOFT, size=9.5, va="center", ha="right")
+    figure.text(right - 0.125, y, "actual", color=SOFT, size=9.5, va="center")
+    _draw_line(figure, [(right - 0.075, y), (right - 0.057, y)], INK, 0.9, _DASHES)
+    figure.text(right, y, "command", color=SOFT, size=9.5, va="center", ha="right")
 
 
-def _nice_step(least: float) -> float:
+def nice_step(least: float) -> float:
     """Return the smallest of 1, 2, 5 times a power of ten that is at least `least` (> 0)."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= 0.9999 * least)
@@ -429,7 +429,7 @@ def _nice_step(least: float) -> float:
 
 def _ticks(low: float, high: float, least_step: float) -> list[float]:
     """Return the round numbers from `low` to `high`, at least `least_step` apart."""
-    step = _nice_step(least_step)
+    step = nice_step(least_step)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [step * k for k in range(first, last + 1)]
 

@@ -1,5 +1,6 @@
 """The rigid body: how its weight rests on the wheels, and its three velocities in a step."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,6 +17,16 @@ class Vector(NamedTuple):
     yaw: Scalar
 
 
+def times(*factors: Scalar) -> Scalar:
+    """The product; nothing to compute where a factor is Python's 0.0, as in a wheel's direction.
+
+    The compiler must keep 0 · x for the sake of NaN.
+    """
+    if any(isinstance(factor, float) and factor == 0 for factor in factors):
+        return 0.0
+    return math.prod(factors)
+
+
 class Symmetric(NamedTuple):
     """A symmetric 3 x 3 matrix over the body's freedoms."""
 
@@ -29,51 +40,52 @@ class Symmetric(NamedTuple):
     def plus(self, weight: Scalar, a: Vector) -> "Symmetric":
         """With weight · a aᵀ added."""
         return Symmetric(
-            self.xx + weight * a.x * a.x,
-            self.yy + weight * a.y * a.y,
-            self.ww + weight * a.yaw * a.yaw,
-            self.xy + weight * a.x * a.y,
-            self.xw + weight * a.x * a.yaw,
-            self.yw + weight * a.y * a.yaw,
+            self.xx + times(weight, a.x, a.x),
+            self.yy + times(weight, a.y, a.y),
+            self.ww + times(weight, a.yaw, a.yaw),
+            self.xy + times(weight, a.x, a.y),
+            self.xw + times(weight, a.x, a.yaw),
+            self.yw + times(weight, a.y, a.yaw),
         )
 
     def plus_mixed(self, weight: Scalar, a: Vector, b: Vector) -> "Symmetric":
         """With weight · (a bᵀ + b aᵀ) added."""
         return Symmetric(
-            self.xx + 2 * weight * a.x * b.x,
-            self.yy + 2 * weight * a.y * b.y,
-            self.ww + 2 * weight * a.yaw * b.yaw,
-            self.xy + weight * (a.x * b.y + a.y * b.x),
-            self.xw + weight * (a.x * b.yaw + a.yaw * b.x),
-            self.yw + weight * (a.y * b.yaw + a.yaw * b.y),
+            self.xx + times(2, weight, a.x, b.x),
+            self.yy + times(2, weight, a.y, b.y),
+            self.ww + times(2, weight, a.yaw, b.yaw),
+            self.xy + times(weight, times(a.x, b.y) + times(a.y, b.x)),
+            self.xw + times(weight, times(a.x, b.yaw) + times(a.yaw, b.x)),
+            self.yw + times(weight, times(a.y, b.yaw) + times(a.yaw, b.y)),
         )
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
     """Scalar product."""
-    return a.x * b.x + a.y * b.y + a.yaw * b.yaw
+    return times(a.x, b.x) + times(a.y, b.y) + times(a.yaw, b.yaw)
 
 
 def combine(weight_a: Scalar, a: Vector, weight_b: Scalar, b: Vector) -> Vector:
     """weight_a · a + weight_b · b."""
     return Vector(
-        weight_a * a.x + weight_b * b.x,
-        weight_a * a.y + weight_b * b.y,
-        weight_a * a.yaw + weight_b * b.yaw,
+        times(weight_a, a.x) + times(weight_b, b.x),
+        times(weight_a, a.y) + times(weight_b, b.y),
+        times(weight_a, a.yaw) + times(weight_b, b.yaw),
     )
 
 
 def solve(m: Symmetric, b: Vector) -> Vector:
     """The solution of m v = b for a positive definite m, by its LDLᵀ factors."""
-    l_yx, l_wx = m.xy / m.xx, m.xw / m.xx
-    d_y = m.yy - l_yx * m.xy
+    by_x = 1 / m.xx
+    l_yx, l_wx = m.xy * by_x, m.xw * by_x
+    by_y = 1 / (m.yy - l_yx * m.xy)
     yw = m.yw - l_yx * m.xw
-    l_wy = yw / d_y
+    l_wy = yw * by_y
     d_w = m.ww - l_wx * m.xw - l_wy * yw
     z_y = b.y - l_yx * b.x
     yaw = (b.yaw - l_wx * b.x - l_wy * z_y) / d_w
-    y = z_y / d_y - l_wy * yaw
-    return Vector(b.x / m.xx - l_yx * y - l_wx * yaw, y, yaw)
+    y = z_y * by_y - l_wy * yaw
+    return Vector(b.x * by_x - l_yx * y - l_wx * yaw, y, yaw)
 
 
 def wheel_loads(body: Body, ax: Scalar, ay: Scalar) -> Wheels:

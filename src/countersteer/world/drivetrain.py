@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import jax
+
 from countersteer.car.car import Car, Wheels
 from countersteer.car.parameter import Scalar
 from countersteer.world.motor import Drive
@@ -20,7 +22,7 @@ class Axle(NamedTuple):
     own_left: Scalar  # J + h (R² k + b), kg m²
     own_right: Scalar
     link: Scalar  # h times the differential's coupling
-    determinant: Scalar
+    inverse: Scalar  # of the determinant
     share_left: Scalar  # speed of a wheel per torque impulse of the shaft
     share_right: Scalar
     resistance: Scalar  # torque impulse per mean speed of the axle
@@ -56,7 +58,7 @@ def rotor_inertia(car: Car) -> Scalar:
 
 def drag(car: Car, speed: Scalar) -> Scalar:
     """Drag of one wheel as a torque per speed (N m s): dry drag fades out at standstill."""
-    dry = car.drivetrain.drag / (speed**2 + STANDSTILL**2) ** 0.5
+    dry = car.drivetrain.drag * jax.lax.rsqrt(speed**2 + STANDSTILL**2)
     return (dry + car.drivetrain.drag_viscous) / 4
 
 
@@ -65,13 +67,14 @@ def axle(lock: Scalar, own_left: Scalar, own_right: Scalar, h: Scalar) -> Axle:
     link = h * coupling(lock)
     both = own_left + own_right
     determinant = own_left * own_right + link * both
+    inverse = 1 / determinant
     return Axle(
         own_left,
         own_right,
         link,
-        determinant,
-        (own_right + 2 * link) / (2 * determinant),
-        (own_left + 2 * link) / (2 * determinant),
+        inverse,
+        (own_right + 2 * link) * (inverse / 2),
+        (own_left + 2 * link) * (inverse / 2),
         4 * determinant / (both + 4 * link),
     )
 
@@ -93,13 +96,14 @@ def shaft(car: Car, front: Axle, rear: Axle, drive: Drive, speed: Scalar, h: Sca
     c_rr = to_rear**2 * load + link
     c_fr = to_front * to_rear * load - link
     a_f, a_r = front.resistance, rear.resistance
-    determinant = a_f * a_r + a_f * c_rr + a_r * c_ff + link * load
+    inverse = 1 / (a_f * a_r + a_f * c_rr + a_r * c_ff + link * load)
+    front_part, rear_part = a_f * inverse, a_r * inverse
     return Shaft(
-        a_f * (to_front * a_r + link) * impulse / determinant,
-        a_r * (to_rear * a_f + link) * impulse / determinant,
-        a_f * (a_r * c_ff + link * load) / determinant,
-        a_r * (a_f * c_rr + link * load) / determinant,
-        a_f * a_r * c_fr / determinant,
+        front_part * (to_front * a_r + link) * impulse,
+        rear_part * (to_rear * a_f + link) * impulse,
+        front_part * (a_r * c_ff + link * load),
+        rear_part * (a_f * c_rr + link * load),
+        front_part * a_r * c_fr,
     )
 
 
@@ -116,6 +120,6 @@ def shaft_impulses(s: Shaft, front: Axle, rear: Axle, momenta: Wheels) -> tuple[
 def wheel_speeds(a: Axle, left: Scalar, right: Scalar, impulse: Scalar) -> tuple[Scalar, Scalar]:
     """Speeds of an axle's wheels from their free angular momenta and the shaft's impulse."""
     return (
-        ((a.own_right + a.link) * left + a.link * right) / a.determinant + a.share_left * impulse,
-        ((a.own_left + a.link) * right + a.link * left) / a.determinant + a.share_right * impulse,
+        ((a.own_right + a.link) * left + a.link * right) * a.inverse + a.share_left * impulse,
+        ((a.own_left + a.link) * right + a.link * left) * a.inverse + a.share_right * impulse,
     )

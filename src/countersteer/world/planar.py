@@ -16,9 +16,9 @@ form, and a 3 x 3 system is left for the body.
 A contact whose slip keeps its direction is followed along the tangent of its law, any other along
 its chord, which is -k times the slip at the end of the stage. Chords alone take energy out at any
 step h and any k >= 0, as the held system is then symmetric and every mode of it is damped;
-tangents do not guarantee it. So a tick that ends with more kinetic energy than it began with and
-the motor (or a Magic Formula's shift) can have put in is taken again, by one implicit Euler step
-on chords: it gives up order, and contacts cannot put energy in.
+tangents do not guarantee it. So a tick that would end with more kinetic energy than it began with
+and the motor (or a Magic Formula's shift) can have put in is taken in part, and the next one on
+chords, which always gets on: it gives up order, and contacts cannot put energy in.
 
 Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 """
@@ -34,11 +34,11 @@ import numpy as np
 from countersteer.car.car import Car, Wheels, wheel_positions
 from countersteer.car.parameter import Array, Scalar
 from countersteer.world import battery, chassis, drivetrain, motor, servo, tyre, walls
-from countersteer.world.chassis import Symmetric, Vector, combine, dot
+from countersteer.world.chassis import Symmetric, Vector, combine, dot, times
 from countersteer.world.state import Motion, State
 
 ROLL_OVER_TIME = 0.1  # s that a pair of wheels is in the air until the car counts as rolled over
-TANGENT, CHORD = Wheels(1.0, 1.0, 1.0, 1.0), Wheels(0.0, 0.0, 0.0, 0.0)
+TANGENT = Wheels(1.0, 1.0, 1.0, 1.0)
 GAMMA = 1 - math.sqrt(0.5)  # of the two-stage method
 TOUCH_TIME = 0.2  # s without contact after which the next one is a new touch
 
@@ -89,7 +89,7 @@ def initial_state(
         lambda leaf: leaf if isinstance(leaf, jax.Array) else dtype.type(leaf), motion
     )
     line = np.zeros(slots, dtype)
-    return State(motion, line, line, zero, zero, zero, zero)
+    return State(motion, line, line, zero, zero, zero, zero, zero)
 
 
 def delay_slots(car: Car, dt: float) -> int:
@@ -131,9 +131,8 @@ def delay(state: State, tick: Tick) -> tuple[State, Tick]:
 
 def _delayed(line: Array, now: Scalar, time: Scalar, tick: Tick) -> tuple[Array, Scalar]:
     slots = line.shape[0]
-    line = jax.lax.dynamic_update_index_in_dim(
-        line, jnp.asarray(now, line.dtype), tick.count % slots, 0
-    )
+    # A choice by slot stays in place in a batch; an update by index would transpose it.
+    line = jnp.where(jnp.arange(slots) == tick.count % slots, jnp.asarray(now, line.dtype), line)
     ticks = jnp.clip(time / tick.dt, 0.0, slots - 2)
     whole = jnp.floor(ticks)
     newest = tick.count - whole.astype(jnp.int32)
@@ -159,16 +158,9 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
 
     held = grip(car, middle)
     before = rotated(velocity, h / 2 * start.yaw_rate)  # in the axes of the tick's middle
-    after, wheels = two_stages(car, held, steady(at_start, held), before, start.wheels, h)
-    bound = kinetic_energy(car, before, start.wheels) + h * (
-        jnp.maximum(
-            motor_power(car, held.drive, start.wheels), motor_power(car, held.drive, wheels)
-        )
-        + pushed_power(held)
-    )
-    holds = kinetic_energy(car, after, wheels) <= bound
-    safe = implicit(car, held, CHORD, before, start.wheels, h)
-    after, wheels = jax.tree.map(lambda a, b: jnp.where(holds, a, b), (after, wheels), safe)
+    lean = Wheels(*(w * (1 - state.wary) for w in steady(at_start, held)))
+    after, wheels = two_stages(car, held, lean, before, start.wheels, h)
+    (after, wheels), wary = guarded(car, held, (before, start.wheels), (after, wheels), h)
 
     end = loaded(car, follow(car, start, goal, h), start, combine(1.0, after, -1.0, before), h)
     turn = h * (start.yaw_rate + after.yaw) / 2
@@ -186,7 +178,33 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
         wheels=wheels,
         charge=battery.drained(car.battery, start.charge, h * held.drive.battery_current),
     )
-    return state._replace(motion=motion), tick
+    return state._replace(motion=motion, wary=wary), tick
+
+
+def guarded(
+    car: Car,
+    held: "Grip",
+    before: tuple[Vector, Wheels],
+    after: tuple[Vector, Wheels],
+    h: Scalar,
+) -> tuple[tuple[Vector, Wheels], Scalar]:
+    """The velocities after a tick, short of gaining energy, and 1 if they would have, else 0.
+
+    With the change d, the energy after the part p of it is E + p g + p² K(d). Beyond
+    p = (h P - g) / K(d) it exceeds what the power P can have put in; half of that is taken.
+    """
+    power = pushed_power(held) + jnp.maximum(
+        *(motor_power(car, held.drive, wheels) for _, wheels in (before, after))
+    )
+    change = jax.tree.map(lambda a, b: a - b, after, before)
+    energy, curvature = kinetic_energy(car, *before), kinetic_energy(car, *change)
+    gain = kinetic_energy(car, *after) - energy
+    rounding = 4 * jnp.finfo(jnp.result_type(energy)).eps * energy
+    gains = gain > h * power + rounding
+    slope = gain - curvature
+    part = jnp.clip((h * power - slope) / (2 * jnp.where(gains, curvature, 1.0)), 0.0, 1.0)
+    limited = jax.tree.map(lambda b, d, a: jnp.where(gains, b + part * d, a), before, change, after)
+    return limited, jnp.where(gains, 1.0, 0.0)
 
 
 def two_stages(
@@ -251,11 +269,17 @@ def rotated(v: Vector, angle: Scalar) -> Vector:
     return Vector(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
 
 
+class Steered(NamedTuple):
+    """Cosine and sine of each front wheel's angle."""
+
+    left: tuple[Scalar, Scalar]
+    right: tuple[Scalar, Scalar]
+
+
 class Grip(NamedTuple):
     """What acts on the car at an instant, as coefficients of its velocities."""
 
-    rolls: Wheels  # how the body's velocities move each contact along its wheel
-    slides: Wheels  # and to the wheel's left
+    steered: Steered
     contacts: Wheels  # a tyre.Contact each
     drag: Wheels  # N m s
     drive: motor.Drive
@@ -265,7 +289,8 @@ class Grip(NamedTuple):
 def grip(car: Car, motion: Motion) -> Grip:
     """Contacts, drag and drive at an instant."""
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
-    rolls, slides = contact_directions(car, motion.steering)
+    steered = Steered(*servo.directions(car.body, car.servo, motion.steering))
+    rolls, slides = contact_directions(car, steered)
     loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
     found = []
     for tire, load, speed, roll, slide in zip(
@@ -275,8 +300,7 @@ def grip(car: Car, motion: Motion) -> Grip:
         found.append(tyre.contact(tire, load, dot(roll, velocity) - rim, dot(slide, velocity), rim))
     driven = drivetrain.driven_speed(car, motion.wheels)
     return Grip(
-        rolls,
-        slides,
+        steered,
         Wheels(*found),
         Wheels(*(drivetrain.drag(car, speed) for speed in motion.wheels)),
         motor.drive(car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven),
@@ -293,6 +317,7 @@ def implicit(
     A contact's force is taken along its chord where `lean` is 0, along its tangent where it is 1.
     """
     body, tires = car.body, tires_by_wheel(car)
+    rolls, slides = contact_directions(car, held.steered)
     along, across, push_x, push_y = [], [], [], []
     for c, w in zip(held.contacts, lean, strict=True):
         along.append(c.k_x + w * (c.tangent_x - c.k_x))
@@ -320,36 +345,35 @@ def implicit(
     standing = _speeds(front, rear, coupled, free)  # if the hubs stood still
 
     # The body: (inertia + what the contacts resist with) velocity' = momentum + what wheels push.
-    zero = 0.0 * body.mass
-    matrix = Symmetric(body.mass, body.mass, body.yaw_inertia, zero, zero, zero)
+    matrix = Symmetric(body.mass, body.mass, body.yaw_inertia, 0.0, 0.0, 0.0)
     momentum = Vector(
         body.mass * velocity.x, body.mass * velocity.y, body.yaw_inertia * velocity.yaw
     )
     for i in range(4):
-        matrix = matrix.plus(h * across[i], held.slides[i])
+        matrix = matrix.plus(h * across[i], slides[i])
         push = pull[i] * standing[i] + h * push_x[i]
-        momentum = combine(1.0, momentum, push, held.rolls[i])
-        momentum = combine(1.0, momentum, h * push_y[i], held.slides[i])
+        momentum = combine(1.0, momentum, push, rolls[i])
+        momentum = combine(1.0, momentum, h * push_y[i], slides[i])
     pulls = []
     for axle, left, right in ((front, 0, 1), (rear, 2, 3)):
         for this, other_own in ((left, axle.own_right), (right, axle.own_left)):
             # h k - pull² (inverse of the axle's matrix), written so that nothing cancels
             resists = bare[this] * (other_own + axle.link) + axle.link * other_own
-            matrix = matrix.plus(h * along[this] * resists / axle.determinant, held.rolls[this])
-        mixed = -pull[left] * pull[right] * axle.link / axle.determinant
-        matrix = matrix.plus_mixed(mixed, held.rolls[left], held.rolls[right])
+            matrix = matrix.plus(h * along[this] * resists * axle.inverse, rolls[this])
+        mixed = -pull[left] * pull[right] * axle.link * axle.inverse
+        matrix = matrix.plus_mixed(mixed, rolls[left], rolls[right])
         pulls.append(
             combine(
                 pull[left] * axle.share_left,
-                held.rolls[left],
+                rolls[left],
                 pull[right] * axle.share_right,
-                held.rolls[right],
+                rolls[right],
             )
         )
     matrix = matrix.plus(coupled.front_front, pulls[0]).plus(coupled.rear_rear, pulls[1])
     matrix = matrix.plus_mixed(coupled.front_rear, pulls[0], pulls[1])
     after = chassis.solve(matrix, momentum)
-    pushed = Wheels(*(free[i] + pull[i] * dot(held.rolls[i], after) for i in range(4)))
+    pushed = Wheels(*(free[i] + pull[i] * dot(rolls[i], after) for i in range(4)))
     return after, _speeds(front, rear, coupled, pushed)
 
 
@@ -363,15 +387,14 @@ def _speeds(
     )
 
 
-def contact_directions(car: Car, steering: Scalar) -> tuple[Wheels, Wheels]:
+def contact_directions(car: Car, steered: Steered) -> tuple[Wheels, Wheels]:
     """How the body's velocities move each contact: along its wheel, and to the wheel's left."""
     xs, ys = wheel_positions(car.body)
-    left, right = servo.directions(car.body, car.servo, steering)
     ahead = (1.0, 0.0)
     rolls, slides = [], []
-    for x, y, (cosine, sine) in zip(xs, ys, (left, right, ahead, ahead), strict=True):
-        rolls.append(Vector(cosine, sine, x * sine - y * cosine))
-        slides.append(Vector(-sine, cosine, x * cosine + y * sine))
+    for x, y, (cosine, sine) in zip(xs, ys, (*steered, ahead, ahead), strict=True):
+        rolls.append(Vector(cosine, sine, times(x, sine) - y * cosine))
+        slides.append(Vector(-sine, cosine, x * cosine + times(y, sine)))
     return Wheels(*rolls), Wheels(*slides)
 
 
@@ -422,6 +445,7 @@ class Forces(NamedTuple):
 def forces(car: Car, motion: Motion) -> Wheels:
     """The four contacts' forces at an instant."""
     held = grip(car, motion)
+    rolls, _ = contact_directions(car, held.steered)
     loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
     return Wheels(
         *(
@@ -433,7 +457,7 @@ def forces(car: Car, motion: Motion) -> Wheels:
                 jnp.arctan2(roll.y, roll.x),
             )
             for tire, load, roll, c in zip(
-                tires_by_wheel(car), loads, held.rolls, held.contacts, strict=True
+                tires_by_wheel(car), loads, rolls, held.contacts, strict=True
             )
         )
     )

@@ -1,5 +1,6 @@
 """Steering: from the angle asked for to where each front wheel points."""
 
+import jax
 import jax.numpy as jnp
 
 from countersteer.car.car import Body, Servo
@@ -40,7 +41,7 @@ def directions(
     spread = servo.ackermann * tangent * body.track / (2 * body.wheelbase)
 
     def direction(t: Scalar) -> tuple[Scalar, Scalar]:
-        cosine = 1 / jnp.sqrt(1 + t**2)
+        cosine = jax.lax.rsqrt(1 + t**2)
         return cosine, t * cosine
 
     return direction(tangent / (1 - spread)), direction(tangent / (1 + spread))

@@ -64,18 +64,18 @@ def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: S
     Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 3 (brush model); E. Fiala, VDI-Z 96,
     1954.
     """
-    speed = jnp.sqrt(rim_speed**2 + tire.creep_speed**2)
-    linear_x = tire.longitudinal_stiffness / speed
-    linear_y = tire.cornering_stiffness / speed
+    slowness = jax.lax.rsqrt(rim_speed**2 + tire.creep_speed**2)
+    linear_x = tire.longitudinal_stiffness * slowness
+    linear_y = tire.cornering_stiffness * slowness
     linear = jnp.sqrt((linear_x * slip_x) ** 2 + (linear_y * slip_y) ** 2 + TINY**2)
-    slides = jnp.minimum(linear / (3 * tire.friction), 1.0)
+    slides = jnp.minimum(linear * (1 / (3 * tire.friction)), 1.0)
     adheres = (1 - slides) ** 2
-    slip = jnp.sqrt(slip_x**2 + slip_y**2 + TINY**2)
-    sliding = tire.sliding_ratio * tire.friction * slides**2 * (3 - 2 * slides) / slip
+    slip = jax.lax.rsqrt(slip_x**2 + slip_y**2 + TINY**2)  # its inverse
+    sliding = tire.sliding_ratio * tire.friction * slides**2 * (3 - 2 * slides) * slip
     k_x, k_y = load * (linear_x * adheres + sliding), load * (linear_y * adheres + sliding)
     # Along the slip the slope is dF/dz, and never less than none; across it, it is k itself.
     slope = load * (1 - slides) * jnp.maximum(1 - (3 - 2 * tire.sliding_ratio) * slides, 0.0)
-    part_x = (slip_x**2 + TINY**2 / 2) / slip**2
+    part_x = (slip_x**2 + TINY**2 / 2) * slip**2
     tangent_x = part_x * slope * linear_x + (1 - part_x) * k_x
     tangent_y = (1 - part_x) * slope * linear_y + part_x * k_y
     return Contact(slip_x, slip_y, k_x, k_y, 0.0, 0.0, tangent_x, tangent_y)

@@ -1,5 +1,8 @@
 """Walls: the car's rectangle against line segments."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -8,7 +11,82 @@ from countersteer.car.parameter import Scalar
 from countersteer.world.state import Motion
 
 FAR = 1e5  # m
+FEW = 16
 PREFERENCE = 1e-3  # depth that a wall gives up per distance by which it misses the corner
+
+
+class Overlap(NamedTuple):
+    """How the car's rectangle and a wall overlap, in axes at the rectangle's centre (m)."""
+
+    on_wall: Scalar  # along the wall's normal
+    ahead: Scalar  # along the car, from its front
+    behind: Scalar
+    to_left: Scalar
+    to_right: Scalar
+    normal_x: Scalar  # of the wall, towards the car
+    normal_y: Scalar
+    point_x: Scalar  # on the wall: its deepest corner's foot
+    point_y: Scalar
+    missed: Scalar  # by how much the wall ends short of that corner
+
+    @property
+    def on_x(self) -> Scalar:
+        """Along the car, from the nearer end."""
+        return jnp.minimum(self.ahead, self.behind)
+
+    @property
+    def on_y(self) -> Scalar:
+        """Across the car, from the nearer side."""
+        return jnp.minimum(self.to_left, self.to_right)
+
+    @property
+    def depth(self) -> Scalar:
+        """The least overlap on all axes; negative where one separates the two."""
+        return jnp.minimum(jnp.minimum(self.on_x, self.on_y), self.on_wall)
+
+
+class Wall(NamedTuple):
+    """A segment: one end, the direction to the other and its length (m)."""
+
+    x: Scalar
+    y: Scalar
+    along_x: Scalar
+    along_y: Scalar
+    length: Scalar
+
+    @property
+    def end(self) -> tuple[Scalar, Scalar]:
+        """The other end."""
+        return self.x + self.length * self.along_x, self.y + self.length * self.along_y
+
+
+def overlap(body: Body, wall: Wall) -> Overlap:
+    """The rectangle about the origin against a wall."""
+    half_x, half_y = body.length / 2, body.width / 2
+    ax, ay, tx, ty, length = wall
+    bx, by = wall.end
+    nx, ny = -ty, tx
+    side = jnp.where(nx * ax + ny * ay > 0, -1.0, 1.0)  # towards the rectangle's centre
+    nx, ny = side * nx, side * ny
+    reach = jnp.abs(nx) * half_x + jnp.abs(ny) * half_y
+    # Along the wall: the deepest corner, or the middle of a side that lies flat, on the wall.
+    corner_x, corner_y = -_sign(nx) * half_x, -_sign(ny) * half_y
+    middle = (corner_x - ax) * tx + (corner_y - ay) * ty
+    spread = jnp.abs(tx) * half_x * (corner_x == 0) + jnp.abs(ty) * half_y * (corner_y == 0)
+    first, last = jnp.clip(middle - spread, 0.0, length), jnp.clip(middle + spread, 0.0, length)
+    at = (first + last) / 2
+    return Overlap(
+        on_wall=reach + nx * ax + ny * ay,
+        ahead=half_x - jnp.minimum(ax, bx),
+        behind=half_x + jnp.maximum(ax, bx),
+        to_left=half_y - jnp.minimum(ay, by),
+        to_right=half_y + jnp.maximum(ay, by),
+        normal_x=nx,
+        normal_y=ny,
+        point_x=ax + at * tx,
+        point_y=ay + at * ty,
+        missed=jnp.maximum(jnp.abs(at - middle) - spread, 0.0),
+    )
 
 
 def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scalar]:
@@ -23,55 +101,42 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     """
     cosine, sine = jnp.cos(motion.heading), jnp.sin(motion.heading)
 
-    def to_body(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        dx, dy = x - motion.x, y - motion.y
-        return cosine * dx + sine * dy - body.center, cosine * dy - sine * dx
+    def to_body(wall: Wall) -> Wall:
+        dx, dy = wall.x - motion.x, wall.y - motion.y
+        return Wall(
+            cosine * dx + sine * dy - body.center,
+            cosine * dy - sine * dx,
+            cosine * wall.along_x + sine * wall.along_y,
+            cosine * wall.along_y - sine * wall.along_x,
+            wall.length,
+        )
 
-    # Padding stands far off, where it touches nothing and every derivative is finite.
-    walls = jnp.where(jnp.isnan(walls), jnp.asarray([FAR, FAR, FAR + 1, FAR], walls.dtype), walls)
-    ax, ay = to_body(walls[:, 0], walls[:, 1])
-    bx, by = to_body(walls[:, 2], walls[:, 3])
-    half_x, half_y = body.length / 2, body.width / 2
-    length = jnp.sqrt((bx - ax) ** 2 + (by - ay) ** 2 + 1e-18)
-    tx, ty = (bx - ax) / length, (by - ay) / length
-    nx, ny = -ty, tx
-    side = jnp.where(nx * ax + ny * ay > 0, -1.0, 1.0)  # towards the rectangle's centre
-    nx, ny = side * nx, side * ny
-    # Overlap along the segment's normal and along the rectangle's axes (from either side).
-    reach = jnp.abs(nx) * half_x + jnp.abs(ny) * half_y
-    on_wall = reach + nx * ax + ny * ay
-    ahead = half_x - jnp.minimum(ax, bx)
-    behind = half_x + jnp.maximum(ax, bx)
-    to_left = half_y - jnp.minimum(ay, by)
-    to_right = half_y + jnp.maximum(ay, by)
-    on_x, on_y = jnp.minimum(ahead, behind), jnp.minimum(to_left, to_right)
-    depth = jnp.minimum(jnp.minimum(on_x, on_y), on_wall)
+    def score(wall: Wall) -> Scalar:
+        # Of the pieces of one wall, all equally deep, the one that has the corner is preferred.
+        against = overlap(body, to_body(wall))
+        return against.depth - jnp.where(against.depth > 0, PREFERENCE * against.missed, 0.0)
 
-    # Along each wall: the deepest corner, or the middle of a side that lies flat, on the wall.
-    corner_x, corner_y = -_sign(nx) * half_x, -_sign(ny) * half_y
-    middle = (corner_x - ax) * tx + (corner_y - ay) * ty
-    spread = jnp.abs(tx) * half_x * (corner_x == 0) + jnp.abs(ty) * half_y * (corner_y == 0)
-    first, last = jnp.clip(middle - spread, 0.0, length), jnp.clip(middle + spread, 0.0, length)
-    at = (first + last) / 2
-    # Of the pieces of one wall, all equally deep, the one that has the corner takes the contact.
-    missed = jnp.maximum(jnp.abs(at - middle) - spread, 0.0)
-    deepest = jnp.argmax(depth - jnp.where(depth > 0, PREFERENCE * missed, 0.0))
-    take = lambda values: values[deepest]  # noqa: E731  # it is used all over below
-    hits = take(depth) > 0
-    by_wall = take(on_wall) <= jnp.minimum(take(on_x), take(on_y))
-    by_x = take(on_x) <= take(on_y)
-    from_front, from_left = take(ahead) < take(behind), take(to_left) < take(to_right)
+    wall = to_body(_highest(score, _segments(walls)))
+    ax, ay = wall.x, wall.y
+    bx, by = wall.end
+    deepest = overlap(body, wall)
+    hits = deepest.depth > 0
+    by_wall = deepest.on_wall <= jnp.minimum(deepest.on_x, deepest.on_y)
+    by_x = deepest.on_x <= deepest.on_y
+    from_front = deepest.ahead < deepest.behind
+    from_left = deepest.to_left < deepest.to_right
     # The normal points from the wall into the car.
-    normal_x = jnp.where(by_wall, take(nx), jnp.where(by_x, jnp.where(from_front, -1.0, 1.0), 0.0))
-    normal_y = jnp.where(by_wall, take(ny), jnp.where(by_x, 0.0, jnp.where(from_left, -1.0, 1.0)))
+    along = jnp.where(by_x, jnp.where(from_front, -1.0, 1.0), 0.0)
+    across = jnp.where(by_x, 0.0, jnp.where(from_left, -1.0, 1.0))
+    normal_x = jnp.where(by_wall, deepest.normal_x, along)
+    normal_y = jnp.where(by_wall, deepest.normal_y, across)
     first_end = jnp.where(
         by_x,
-        jnp.where(from_front, take(ax) < take(bx), take(ax) > take(bx)),
-        jnp.where(from_left, take(ay) < take(by), take(ay) > take(by)),
+        jnp.where(from_front, ax < bx, ax > bx),
+        jnp.where(from_left, ay < by, ay > by),
     )
-    point_x = jnp.where(by_wall, take(ax + at * tx), jnp.where(first_end, take(ax), take(bx)))
-    point_y = jnp.where(by_wall, take(ay + at * ty), jnp.where(first_end, take(ay), take(by)))
-    point_x = point_x + body.center
+    point_x = jnp.where(by_wall, deepest.point_x, jnp.where(first_end, ax, bx)) + body.center
+    point_y = jnp.where(by_wall, deepest.point_y, jnp.where(first_end, ay, by))
 
     speed_n = normal_x * (motion.vx - motion.yaw_rate * point_y) + normal_y * (
         motion.vy + motion.yaw_rate * point_x
@@ -88,7 +153,7 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     impulse_n, impulse_t = impulse(jnp.where(meets, speed_n, -1.0), speed_t, k_nn, k_tt, k_nt, body)
     impulse_n, impulse_t = jnp.where(meets, impulse_n, 0.0), jnp.where(meets, impulse_t, 0.0)
 
-    out = jnp.where(hits, take(depth), 0.0)
+    out = jnp.where(hits, deepest.depth, 0.0)
     out_x, out_y = out * normal_x, out * normal_y
     force_x = normal_x * impulse_n - normal_y * impulse_t
     force_y = normal_y * impulse_n + normal_x * impulse_t
@@ -101,6 +166,32 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     )
     touched = jax.tree.map(lambda a, b: jnp.where(hits, a, b), moved, motion)
     return touched, jnp.where(hits, 1.0, 0.0)
+
+
+def _segments(walls: jax.Array) -> Wall:
+    """The rows as walls. Padding stands far off: it touches nothing, its derivatives are finite."""
+    walls = jnp.where(jnp.isnan(walls), jnp.asarray([FAR, FAR, FAR + 1, FAR], walls.dtype), walls)
+    x, y, dx, dy = walls[:, 0], walls[:, 1], walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]
+    length = jnp.sqrt(dx**2 + dy**2 + 1e-18)
+    return Wall(x, y, dx / length, dy / length, length)
+
+
+def _highest(score: Callable[[Wall], Scalar], walls: Wall) -> Wall:
+    """The wall of the highest score.
+
+    A few are compared one by one, in scalars: a batch's look-ups by an index are slow.
+    """
+    count = walls.x.shape[0]
+    if count > FEW:
+        chosen = jnp.argmax(score(walls))
+        return Wall(*(values[chosen] for values in walls))
+    rows = [Wall(*(values[i] for values in walls)) for i in range(count)]
+    best, highest = rows[0], score(rows[0])
+    for row in rows[1:]:
+        this = score(row)
+        best = Wall(*(jnp.where(this > highest, a, b) for a, b in zip(row, best, strict=True)))
+        highest = jnp.maximum(this, highest)
+    return best
 
 
 def impulse(

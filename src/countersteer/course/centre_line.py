@@ -1,0 +1,93 @@
+"""Closed courses from centre lines with widths: the CSV files of F1TENTH and its relatives."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from countersteer.course.course import Course, from_track, walls_around
+from countersteer.errors import InputError
+
+COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # in this order where there is no header
+ALIASES = {"d_right": "w_tr_right_m", "d_left": "w_tr_left_m"}
+SAME = 1e-3  # m within which two points are one
+TOLERANCE = 0.01  # of the mean width: how far walls may be from the true edge of the corridor
+MOST_POINTS = 20_000
+NARROWEST, WIDEST, FARTHEST = 0.05, 1e3, 1e5  # m
+
+
+def read_centre_line(path: Path) -> Course:
+    """The closed course along a centre line, starting at its first point.
+
+    A row is a point with the room to the right and to the left of it, split by commas, semicolons
+    or blanks. A header, a comment or not, names the columns (`COLUMNS` in any order among others).
+    The corridor is what the cross-sections sweep, each from wall to wall; so no wall stands in it,
+    also where the inside of a bend is tighter than the room there. Its walls keep within
+    `TOLERANCE` of its true edge. Raises `InputError` naming file and line.
+    """
+    table = _rows(path)
+    points, sides = table[:, :2], table[:, 2:]
+    fresh = np.hypot(*(points - np.roll(points, -1, axis=0)).T) > SAME
+    points, sides = points[fresh], sides[fresh]
+    if not 3 <= len(points) <= MOST_POINTS:
+        raise InputError(f"{path}: {len(points)} points that differ, not 3 to {MOST_POINTS}")
+    if not shapely.LinearRing(points).is_simple:
+        raise InputError(f"{path}: the centre line crosses itself")
+    along = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
+    right, left = points - sides[:, :1] * normal, points + sides[:, 1:] * normal
+    following = [np.roll(side, -1, axis=0) for side in (left, right)]
+    swept = shapely.convex_hull(shapely.linestrings(np.stack([right, left, *following], axis=1)))
+    tolerance = TOLERANCE * float(np.mean(np.sum(sides, axis=1)))
+    # Slivers between pieces that nearly meet are no walls.
+    corridor: Any = shapely.union_all(swept)
+    holes = [h for h in corridor.interiors if not shapely.Polygon(h).buffer(-tolerance).is_empty]
+    if not holes:
+        raise InputError(f"{path}: the widths leave no wall inside the lap")
+    area: Any = shapely.Polygon(corridor.exterior, holes).simplify(tolerance)
+    return from_track(path.stem, points, sides, walls_around(area, str(path)))
+
+
+def _rows(path: Path) -> np.ndarray:
+    """The numbers of the file, its columns as in `COLUMNS`."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise InputError(f"{path}: cannot be read: {reason}") from None
+    names: list[str] = list(COLUMNS)
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        cells = _cells(line.lstrip("# \t"))
+        if "x_m" in cells:
+            names = [ALIASES.get(cell, cell) for cell in cells]
+            for column in COLUMNS:
+                if column not in names:
+                    raise InputError(f"{path}: column {column} is missing")
+        elif line.strip() and not line.lstrip().startswith("#"):
+            if len(cells) < len(names):
+                raise InputError(f"{path}, line {number}: {len(cells)} cells, not {len(names)}")
+            rows.append(
+                [_number(cells[names.index(c)], c, f"{path}, line {number}") for c in COLUMNS]
+            )
+            if not sum(rows[-1][2:]) >= NARROWEST:
+                raise InputError(f"{path}, line {number}: less than {NARROWEST} m wide")
+    return np.array(rows).reshape(-1, len(COLUMNS))
+
+
+def _cells(line: str) -> list[str]:
+    split = next((mark for mark in ";," if mark in line), r"\s+")
+    return [cell.strip() for cell in re.split(split, line.strip())]
+
+
+def _number(cell: str, column: str, where: str) -> float:
+    low, high = (0.0, WIDEST) if column.startswith("w_") else (-FARTHEST, FARTHEST)
+    try:
+        value = float(cell)
+    except ValueError:
+        value = float("nan")
+    if not low <= value <= high:
+        raise InputError(f"{where}: {column} must be a number in [{low:g}, {high:g}], not {cell!r}")
+    return value

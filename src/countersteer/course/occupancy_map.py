@@ -1,0 +1,209 @@
+"""Courses from occupancy maps: the YAML files of ROS's map_server, each beside its image."""
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import contourpy
+import numpy as np
+import shapely
+import yaml
+from PIL import Image
+from scipy import ndimage
+
+from countersteer.course.course import Course, from_track, from_walls, walls_around
+from countersteer.errors import InputError
+
+TOLERANCE = 0.02  # m by which walls may be from the edge between pixels, ...
+PIXELS = 1.0  # ... or so many pixels, if that is more: a slanting edge is a staircase
+SPECK = 4  # pixels: what is smaller within free space is noise, not a wall
+SMOOTH = 4.0  # pixels: standard deviation of the filter along a centre line
+MOST_PIXELS = 40_000_000
+FORMATS = ("PNG", "PPM", "BMP", "JPEG")
+FREE_THRESH = 0.25  # where the file says nothing: that of ROS 2
+AROUND = np.ones((3, 3))  # walls hold together at corners too; free space at edges only
+
+
+class Grid(NamedTuple):
+    """Pixels in the plane."""
+
+    resolution: float  # m
+    x: float  # of the lower left corner
+    y: float
+    yaw: float
+
+    def place(self, pixels: np.ndarray) -> np.ndarray:
+        """(n, 2) column and row, counted from the lower left pixel's middle, as x and y."""
+        along = (pixels + 0.5) * self.resolution
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        return along @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x, self.y]
+
+    def pixel(self, x: float, y: float) -> np.ndarray:
+        """The inverse of `place`, for one point."""
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        x, y = x - self.x, y - self.y
+        local = np.array([cosine * x + sine * y, cosine * y - sine * x])
+        return np.asarray(local / self.resolution - 0.5)
+
+
+def read_map(path: Path) -> Course:
+    """The course that a map's free space makes.
+
+    Walls are the edge of the free pixels that hang together with the origin (0, 0), or with the
+    one nearest to it. Unknown pixels are not free. Between one outer and one inner edge there is a
+    closed course: its centre line is as far from the one as from the other, it starts nearest to
+    the origin and goes the way on which x rises there, or the other with `reverse: true` in the
+    file. Any other free space has free walls, and the car starts at the origin, heading 0.
+    Raises `InputError` naming file and key.
+    """
+    about = _about(path)
+    grid, image = _grid(about, path), path.parent / str(about.get("image"))
+    free = _free(about, path, image)
+    if not np.any(free):
+        raise InputError(f"{path}: {image.name} has no free pixel")
+    begin = grid.pixel(0.0, 0.0)
+    rows, columns = np.nonzero(free)
+    nearest = int(np.argmin((columns - begin[0]) ** 2 + (rows - begin[1]) ** 2))
+    at_origin = np.max(np.abs([columns[nearest], rows[nearest]] - begin)) <= 0.5
+    labels, _ = ndimage.label(free)
+    region = labels == labels[rows[nearest], columns[nearest]]
+    # Cut out, with a margin of one pixel that is not free.
+    rows, columns = (np.nonzero(np.any(region, axis=axis))[0] for axis in (1, 0))
+    low = np.array([columns[0], rows[0]])
+    region = np.pad(region[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
+    solid, count = ndimage.label(~region, structure=AROUND)  # 1 is what lies outside
+    sizes = np.bincount(solid.ravel(), minlength=count + 1)
+    region |= (sizes < SPECK)[solid]
+    solid = np.where(region, 0, solid)
+    tolerance = max(TOLERANCE, PIXELS * grid.resolution)
+    area: Any = _outline(region, grid, low - 1).simplify(tolerance)
+    walls = walls_around(area, str(path))
+    if len(area.interiors) == 1:
+        line, sides = _middle(solid == 1, solid > 1)
+        line, sides = _start(grid.place(line + low - 1), sides * grid.resolution, about, path)
+        return from_track(path.stem, line, sides, walls)
+    if not at_origin:
+        raise InputError(f"{path}: the origin (0, 0), where the car starts, is not free")
+    return from_walls(path.stem, walls)
+
+
+def _about(path: Path) -> dict[str, Any]:
+    try:
+        about = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid YAML: too deep") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: cannot be read: it is not text") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if not isinstance(about, dict):
+        raise InputError(f"{path}: not a map: it has no keys")
+    for key in ("image", "resolution", "origin"):
+        if key not in about:
+            raise InputError(f"{path}: {key} is missing")
+    return about
+
+
+def _grid(about: dict[str, Any], path: Path) -> Grid:
+    origin = about["origin"]
+    if not isinstance(origin, list) or len(origin) != 3:
+        raise InputError(f"{path}: origin must be [x, y, yaw] in metres and radians")
+    x, y, yaw = (_number(value, f"{path}: origin", -1e5, 1e5) for value in origin)
+    return Grid(_number(about["resolution"], f"{path}: resolution", 1e-4, 10), x, y, yaw)
+
+
+def _number(value: Any, where: str, low: float, high: float) -> float:
+    try:
+        read = math.nan if isinstance(value, bool) else float(value)  # YAML takes 5e-2 for a text
+    except (TypeError, ValueError):
+        read = math.nan
+    if not low <= read <= high:
+        raise InputError(f"{where} must be a number in [{low:g}, {high:g}], not {value!r}")
+    return read
+
+
+def _flag(about: dict[str, Any], key: str, path: Path) -> bool:
+    value = about.get(key, False)
+    if value not in (0, 1):
+        raise InputError(f"{path}: {key} must be true or false, not {value!r}")
+    return bool(value)
+
+
+def _free(about: dict[str, Any], path: Path, image: Path) -> np.ndarray:
+    """Which pixels are free, the lowest row first: less likely occupied than `free_thresh`."""
+    mode = about.get("mode", "trinary")
+    if mode not in ("trinary", "scale", "raw"):
+        raise InputError(f"{path}: mode must be trinary, scale or raw, not {mode!r}")
+    threshold = _number(about.get("free_thresh", FREE_THRESH), f"{path}: free_thresh", 0, 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # we have our own limit
+            opened = Image.open(image, formats=FORMATS)
+        with opened:
+            width, height = opened.size
+            if width * height > MOST_PIXELS:
+                raise InputError(
+                    f"{path}: {image.name} has {width} × {height} pixels, over {MOST_PIXELS}"
+                )
+            if opened.mode.startswith("I"):  # 16 bits
+                shade, opaque = np.asarray(opened) / 257, np.ones((height, width), bool)
+            else:
+                channels = np.asarray(opened.convert("RGBA"))
+                shade, opaque = np.mean(channels[..., :3], axis=-1), channels[..., 3] > 0
+    except Image.DecompressionBombError:
+        raise InputError(f"{path}: {image.name} has over {MOST_PIXELS} pixels") from None
+    except (OSError, ValueError, SyntaxError) as error:
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise InputError(
+            f"{path}: image {image}: {reason or 'no picture that can be read'}"
+        ) from None
+    if mode == "raw":
+        occupied = shade / 100  # per cent; from 101 on unknown
+    else:
+        occupied = shade / 255 if _flag(about, "negate", path) else (255 - shade) / 255
+    return np.asarray(((occupied < threshold) & opaque)[::-1])
+
+
+def _outline(region: np.ndarray, grid: Grid, low: np.ndarray) -> shapely.Polygon:
+    """The pixels of a region as an area, along their edges."""
+    # A little over one half: where only corners meet, walls hold together, as in the labels.
+    contours = contourpy.contour_generator(z=region.astype(float), fill_type="OuterOffset")
+    filled: Any = contours.filled(0.501, 2.0)
+    (points,), (offsets,) = filled
+    rings = [grid.place(ring + low) for ring in np.split(points, offsets[1:-1])]
+    return shapely.Polygon(rings[0], rings[1:])
+
+
+def _middle(outer: np.ndarray, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The closed line as far from `outer` as from `inner`, and that distance, in pixels.
+
+    Counter-clockwise, its points 2 pixels apart. There is one such line: who is nearer to `outer`
+    stays so on the way to it.
+    """
+    away = [np.asarray(ndimage.distance_transform_edt(~solid)) for solid in (outer, inner)]
+    lines: Any = contourpy.contour_generator(z=away[0] - away[1]).lines(0.0)
+    line = max(lines, key=len)
+    if not shapely.LinearRing(line).is_ccw:
+        line = line[::-1]
+    marks = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    even = np.linspace(0.0, marks[-1], max(8, round(marks[-1] / 2)), endpoint=False)
+    even_line = np.stack([np.interp(even, marks, line[:, i]) for i in (0, 1)], axis=1)
+    spacing = marks[-1] / len(even)
+    line = ndimage.gaussian_filter1d(even_line, SMOOTH / spacing, axis=0, mode="wrap")
+    # The edge of a pixel is half a pixel before its middle. The inner wall is to the left.
+    room = [ndimage.map_coordinates(a, line.T[::-1], order=1, mode="nearest") - 0.5 for a in away]
+    return line, np.maximum(np.stack(room, axis=1), 0.0)
+
+
+def _start(
+    line: np.ndarray, sides: np.ndarray, about: dict[str, Any], path: Path
+) -> tuple[np.ndarray, np.ndarray]:
+    """The line from its point nearest to the origin on, in the direction in which it is driven."""
+    first = int(np.argmin(np.hypot(*line.T)))
+    ahead = line[(first + 1) % len(line)] - line[first - 1]
+    if (ahead[0] < 0) != _flag(about, "reverse", path):
+        line, sides, first = line[::-1], sides[::-1, ::-1], len(line) - 1 - first
+    return np.roll(line, -first, axis=0), np.roll(sides, -first, axis=0)
