@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import start, varied
-from countersteer.car.car import Car, Mount, Sonar
+from countersteer.car.car import Car, LineDetector, Mount, Sonar
 from countersteer.car.files import load_car
 from countersteer.course.course import place
 from countersteer.course.files import load_course
@@ -406,6 +406,56 @@ def test_the_noise_of_different_sensors_is_independent(listen: Callable) -> None
 def test_quantising_by_nothing_changes_nothing() -> None:
     assert float(parts.quantised(0.123456789, 0.0)) == 0.123456789
     assert float(parts.quantised(0.26, 0.5)) == 0.5
+
+
+# The line detector
+
+
+LINED = dataclasses.replace(
+    RX7,
+    sensors=dataclasses.replace(
+        RX7.sensors,
+        line_detector=jax.tree.map(
+            np.float64, LineDetector(lines="across-x", spacing=0.1, width=0.02, x=0.06)
+        ),
+    ),
+)
+
+
+def test_lines_are_counted_where_the_eye_enters_them_and_give_the_speed(listen: Callable) -> None:
+    x = 1.713 * DT * np.arange(1, TICKS + 1)
+    told = listen(LINED, x=x, vx=1.713)
+    # The eye starts at 0.06 m; each line is entered 0.01 m before its middle.
+    edges = np.arange(0.09, 0.06 + x[-1], 0.1)
+    ticks = np.ceil((edges - 0.06) / 1.713 / DT)
+    entered = np.flatnonzero(np.diff(told.line_crossings.value, prepend=0)) + 1
+    np.testing.assert_array_equal(entered, ticks)
+    assert told.line_crossings.value[-1] == len(edges)
+    np.testing.assert_array_equal(fresh(told.line_speed), ticks[1:])
+    speed = told.line_speed.value[told.line_speed.tick > 0]
+    assert speed == pytest.approx(1.713, rel=1.713 * DT / 0.1)
+    assert np.mean(speed) == pytest.approx(1.713, rel=2e-3)
+
+
+def test_a_line_is_entered_from_both_sides_and_not_by_turning_on_it(listen: Callable) -> None:
+    # On to the line at 0.1 m and off it again; then over it, and back over the whole of it.
+    way = [0.0, 0.1, 0.05, 0.15, 0.05]
+    x = np.interp(np.arange(TICKS), np.linspace(0, TICKS - 1, len(way)), way) - 0.06
+    counts = listen(LINED, x=x).line_crossings.value
+    ends = np.linspace(0, TICKS - 1, len(way)).astype(int)
+    np.testing.assert_array_equal(np.diff(counts[ends], prepend=0), [0, 1, 0, 1, 1])
+
+
+def test_the_eye_turns_with_the_car(listen: Callable) -> None:
+    heading = np.linspace(0, 2 * math.pi, TICKS)
+    told = listen(LINED, heading=heading, x=0.0)  # from 0.06 to -0.06 m and back
+    assert told.line_crossings.value[-1] == 2
+
+
+def test_without_lines_the_detector_is_not_there(listen: Callable) -> None:
+    told = listen(RX7)
+    assert told.line_crossings is told.line_speed is None
+    assert suite.initial_memory(RX7, start(RX7, 4).motion).eye is None
 
 
 @pytest.mark.parametrize("name", ["box", "ess"])

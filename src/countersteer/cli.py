@@ -141,10 +141,37 @@ def parser() -> Parser:
     )
 
     take = verb("import", "other people's logs to run folders", run_import)
-    take.add_argument("format", choices=("dart",), metavar="FORMAT", help="dart")
+    take.add_argument("format", choices=("dart", "eth"), metavar="FORMAT", help="dart or eth")
     take.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a log")
     take.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder of the run folders"
+    )
+
+    trials = verb("trials", "commands for a series of drives", run_trials)
+    trials.add_argument(
+        "what",
+        choices=("throttle-steps",),
+        help="throttle-steps: from rest, straight, each a second at one throttle, then none",
+    )
+    trials.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the files"
+    )
+    trials.add_argument(
+        "--levels", metavar="LIST", help="throttles, such as 0.2,0.5 (default ten, 0.1 to 1)"
+    )
+    trials.add_argument(
+        "--duration-s",
+        type=number(0.01, 60),
+        default=1.0,
+        metavar="S",
+        help="at each throttle (default 1)",
+    )
+    trials.add_argument(
+        "--rate-hz",
+        type=number(1, 1000),
+        default=100.0,
+        metavar="HZ",
+        help="rows a second (default 100)",
     )
 
     export = verb("export", "a run seen from above, as a GIF or an MP4", run_export)
@@ -353,14 +380,29 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) ->
 def run_import(options: argparse.Namespace) -> int:
     """`import`."""
     from countersteer.runs.dart import import_dart
+    from countersteer.runs.eth import import_eth
 
+    importer = {"dart": import_dart, "eth": import_eth}[options.format]
     results = []
     for file in options.files:
-        results.append(import_dart(file, options.out))
+        results.append(importer(file, options.out))
         if not options.json:
             print(f"{file.name} -> {options.out / file.stem}")
     if options.json:
         print(json.dumps({"runs": results}))
+    return DONE
+
+
+def run_trials(options: argparse.Namespace) -> int:
+    """`trials`."""
+    from countersteer.evaluation.trials import LEVELS, read_levels, throttle_steps
+
+    levels = LEVELS if options.levels is None else read_levels(options.levels)
+    result = throttle_steps(options.out, levels, options.duration_s, options.rate_hz)
+    if options.json:
+        print(json.dumps(result))
+    else:
+        print((options.out / "README.txt").read_text(), end="")
     return DONE
 
 

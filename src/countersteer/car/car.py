@@ -324,6 +324,20 @@ class Voltmeter:
 
 
 @pytree
+class LineDetector:
+    """An eye on the floor, which bears lines at a known spacing along the world's x axis."""
+
+    lines: str = choice(
+        "none",
+        ("none", "across-x"),
+        "none: no detector; across-x: lines across the world's x axis, one at x = 0",
+    )
+    spacing: Scalar = parameter(0.1, "m", 0.01, 100, "between the middles of two lines")
+    width: Scalar = parameter(0.01, "m", 0, 1, "of a line; it is reported when the eye enters it")
+    x: Scalar = parameter(0.0, "m", -5, 5, "of the eye, forward of the centre of mass")
+
+
+@pytree
 class Sensors:
     """What the car carries to sense with."""
 
@@ -332,6 +346,7 @@ class Sensors:
     gyroscope: Gyroscope = Gyroscope()
     accelerometer: Accelerometer = Accelerometer()
     voltmeter: Voltmeter = Voltmeter()
+    line_detector: LineDetector = LineDetector()
 
 
 @pytree

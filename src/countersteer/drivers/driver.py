@@ -29,6 +29,8 @@ class Observation(NamedTuple):
     accel_x: Heard  # m/s²
     accel_y: Heard
     battery: Heard  # V
+    line_crossings: Heard | None  # lines entered; None: the car has no line detector
+    line_speed: Heard | None  # m/s, never negative
     estimate: Estimate
 
 

@@ -77,7 +77,8 @@ class Log:
         columns = {n: np.asarray(c)[shown] for n, c in zip(TRUTH, truth, strict=True)}
         told = np.nonzero(ticks[:end] % plan.telemetry == 0)[0]
         telemetry = [time[told]]
-        for reading in (*record.readings.sonar, *record.readings[1:]):
+        sensors = (r for r in record.readings[1:] if r is not None)
+        for reading in (*record.readings.sonar, *sensors):
             new = reading.tick[told] > np.maximum(ticks[told] - plan.telemetry, 0)
             telemetry.append(np.where(new, reading.value[told], np.nan))
         echoes = []
@@ -199,6 +200,9 @@ def about_run(simulator: Simulator, driver: str, car: str, laps: int) -> dict[st
         | {"python": sys.version.split()[0]},
         "car": car_tables(simulator.car),
     }
+    spacing = lines_spacing(simulator)
+    if spacing is not None:
+        about["line_spacing_m"] = spacing
     if simulator.course is not None:
         about["course"] = course_tables(simulator.course)
     if simulator.start is not None:
@@ -220,7 +224,14 @@ def telemetry_header(simulator: Simulator) -> tuple[str, ...]:
         "accel_x_mps2",
         "accel_y_mps2",
         "battery_v",
+        *(("line_crossings", "line_speed_mps") if lines_spacing(simulator) else ()),
     )
+
+
+def lines_spacing(simulator: Simulator) -> float | None:
+    """Distance between the lines that the car's detector looks for (m), if it has one."""
+    part = simulator.car.sensors.line_detector
+    return None if part.lines == "none" else float(part.spacing)
 
 
 class Interrupt:

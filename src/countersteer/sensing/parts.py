@@ -1,9 +1,9 @@
-"""Parts that read a number now and then: encoder, gyroscope, accelerometer, voltmeter."""
+"""Parts that read a number now and then: encoder, gyroscope, accelerometer, voltmeter, lines."""
 
 import jax
 import jax.numpy as jnp
 
-from countersteer.car.car import Accelerometer, Encoder, Gyroscope, Voltmeter, Wheels
+from countersteer.car.car import Accelerometer, Encoder, Gyroscope, LineDetector, Voltmeter, Wheels
 from countersteer.car.parameter import Scalar
 
 
@@ -47,3 +47,18 @@ def accelerometer(
 def voltmeter(part: Voltmeter, voltage: Scalar, noise: Scalar) -> Scalar:
     """A reading (V), given a standard normal number."""
     return quantised(voltage + part.noise * noise, part.resolution)
+
+
+def eye(part: LineDetector, x: Scalar, heading: Scalar) -> Scalar:
+    """Where the eye of a car at x with a heading is along the lines' axis (m)."""
+    return x + part.x * jnp.cos(heading)
+
+
+def lines_entered(part: LineDetector, before: Scalar, now: Scalar) -> Scalar:
+    """How many lines the eye has entered on its way from one place to another (m).
+
+    It enters each at the edge that it meets first; turning round on a line it enters none.
+    """
+    edge = jnp.where(now > before, 0.5, -0.5) * part.width
+    cells = [jnp.floor((place + edge) / part.spacing) for place in (before, now)]
+    return jnp.abs(cells[1] - cells[0])

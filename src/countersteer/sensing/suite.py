@@ -31,6 +31,8 @@ class Readings(NamedTuple):
     accel_x: Reading  # m/s²
     accel_y: Reading
     battery: Reading  # V
+    line_crossings: Reading | None = None  # lines entered since the start; None: no line detector
+    line_speed: Reading | None = None  # m/s, their spacing over the time since the last one
 
 
 class Periods(NamedTuple):
@@ -62,6 +64,7 @@ class Memory(NamedTuple):
     counts_before: Scalar  # at the last report
     vx: Scalar  # at the accelerometer's last report
     vy: Scalar
+    eye: Scalar | None  # place of the line detector's eye (m)
 
 
 def periods(car: Car, dt: float) -> Periods:
@@ -84,7 +87,11 @@ def initial_memory(car: Car, motion: Motion) -> Memory:
     zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
     no_echo = none._replace(value=dtype(np.inf))
     readings = Readings(tuple(no_echo for _ in car.sensors.sonar.mounts), *[none] * 6)
-    return Memory(readings, zero, zero, zero, motion.vx, motion.vy)
+    eye, part = None, car.sensors.line_detector
+    if part.lines != "none":
+        readings = readings._replace(line_crossings=none, line_speed=none)
+        eye = parts.eye(part, motion.x, motion.heading)
+    return Memory(readings, zero, zero, zero, motion.vx, motion.vy, eye)
 
 
 def sense(
@@ -172,9 +179,35 @@ def sense(
         reports.append((due(every.sonar, tick), ping))
     for now, report in reports:
         readings = jax.lax.cond(now, report, lambda same: same, readings)
+    if memory.eye is not None:
+        eye = parts.eye(sensors.line_detector, motion.x, motion.heading)
+        readings = cross(car, readings, memory.eye, eye, tick, dt)
+        memory = memory._replace(eye=eye)
     return memory._replace(
         readings=readings,
         counts_before=jnp.where(counted, memory.counts, memory.counts_before),
         vx=jnp.where(weighed, motion.vx, memory.vx),
         vy=jnp.where(weighed, motion.vy, memory.vy),
+    )
+
+
+def cross(
+    car: Car, readings: Readings, before: Scalar, eye: Scalar, tick: Scalar, dt: float
+) -> Readings:
+    """The line detector after a tick. It looks every tick, and reports when it enters a line.
+
+    The first line gives no speed. Speed is blind to direction, and wrong where the car turned back.
+    """
+    part, last, speed = car.sensors.line_detector, readings.line_crossings, readings.line_speed
+    assert last is not None
+    assert speed is not None
+    entered = parts.lines_entered(part, before, eye)
+    again = (entered > 0) & (last.tick >= 0)
+    between = jnp.maximum(tick - last.tick, 1) * dt
+    return readings._replace(
+        line_crossings=Reading(last.value + entered, jnp.where(entered > 0, tick, last.tick)),
+        line_speed=Reading(
+            jnp.where(again, entered * part.spacing / between, speed.value),
+            jnp.where(again, tick, speed.tick),
+        ),
     )
