@@ -5,7 +5,6 @@ depends on the car by JAX: where the servo and the speed controller stand at its
 wheels turn at, and the motion to its end. So residuals have exact derivatives.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
