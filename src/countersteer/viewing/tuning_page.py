@@ -466,7 +466,9 @@ def _run(run: Mapping[str, Any], scored: Iterable[Mapping[str, Any]]) -> str:
 def _stretch(run: Mapping[str, Any]) -> tuple[float, float, float]:
     """Begin and end of what is drawn (s), and how long the whole is."""
     channels = [(_array(q["time"]), _array(q["measured"])) for q in run["quantities"]]
-    times = _finite([*(t for time, _ in channels for t in time), *_array(run["commands"]["time"])])
+    times = _finite(
+        np.concatenate([*(time for time, _ in channels), _array(run["commands"]["time"])])
+    )
     if not len(times):
         return 0.0, 1.0, 1.0
     first, last = float(times.min()), max(float(times.max()), float(times.min()) + 1e-3)
