@@ -65,6 +65,7 @@ FOREIGN, FOREIGN_PART = 3.0, 0.3
 LONGEST_STEP = 0.7  # of log R: a factor of two
 ROUNDS = 40  # of descent; it takes five
 
+NEVER_MOVES = "the car does not move: under the dead zone, it tells nothing of acceleration"
 SENSORS = {"encoder": "wheel_speed_mps", "sonar": "sonar_front_m", "lines": "line_crossings"}
 
 
@@ -227,9 +228,6 @@ def _take_all(runs: Sequence[Run], source: str) -> tuple[list[Step], list[Unused
         reasons = "; ".join(f"{path.name}: {reason}" for path, _, reason in unused[:1])
         raise InputError(f"none of {len(runs)} runs tells an acceleration: {reasons}")
     return steps, unused, masked
-
-
-NEVER_MOVES = "the car does not move: under the dead zone, it tells nothing of acceleration"
 
 
 def take(run: Run, source: str) -> tuple[Step, list[str]]:
@@ -612,7 +610,10 @@ def draw_acceleration(found: Acceleration, path: Path) -> None:
         axes.tick_params(length=0, labelsize=9.5, labelcolor=_SOFT)
     for axes in list(grid.flat)[len(found.series) :]:
         axes.set_visible(False)
+    for line in grid:
+        line[0].set_ylim(bottom=0.0)
     for axes in grid[-1]:
+        axes.set_xlim(0.0, DURATION)
         axes.set_xlabel("time since the throttle came, s", color=_SOFT, size=9.5)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(
