@@ -614,6 +614,7 @@ def draw_acceleration(found: Acceleration, path: Path) -> None:
         line[0].set_ylim(bottom=0.0)
     for axes in grid[-1]:
         axes.set_xlim(0.0, DURATION)
+        axes.set_xticks([0.0, 0.2, 0.4, 0.6, 0.8])
         axes.set_xlabel("time since the throttle came, s", color=_SOFT, size=9.5)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(
