@@ -9,7 +9,7 @@ import pytest
 from countersteer.car.files import load_car
 from countersteer.errors import InputError
 from countersteer.evaluation.compare import compare, draw_comparison, sensed
-from countersteer.runs.dart import BEHIND, POINT_X, POINT_Y, import_dart
+from countersteer.runs.dart import POINT_X, POINT_Y, import_dart
 from countersteer.runs.files import TRUTH, Table, TableWriter, command_rows, write_table
 from countersteer.runs.run import Run, read_run
 from countersteer.tuning import windows
@@ -57,7 +57,7 @@ def test_a_recording_becomes_a_run(imported):
     assert list(run.telemetry) == [
         *("time_s", "accel_x_mps2", "accel_y_mps2", "gyro_radps", "wheel_speed_mps", "armed")
     ]
-    assert run.truth["time_s"][0] == BEHIND
+    assert run.truth["time_s"][0] == 0
     assert np.median(np.diff(run.truth["time_s"])) == pytest.approx(0.01, abs=1e-3)
     assert np.all(np.diff(run.commands["time_s"]) > 0.08)
     assert len(run.commands) == len(run.telemetry) == 207

@@ -510,7 +510,7 @@ def tune_acceleration(options: argparse.Namespace, runs: list[Any], car: "Car") 
     from countersteer.tuning.acceleration import draw_acceleration, fit_acceleration
 
     found = fit_acceleration(runs, car, options.source, options.precision)
-    about = {
+    about: dict[str, Any] = {
         "parameter": found.parameter,
         "before": found.before,
         "value": found.after,

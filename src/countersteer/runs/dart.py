@@ -36,12 +36,6 @@ FULL_LOCK = 25.0  # degrees of the front wheels that a steering of 1 nominally a
 POINT_X, POINT_Y = 0.0220, -0.01
 YAW_ERROR = 0.0077  # added to the captured yaw; the sideslip of slow circles then is 0 on average
 
-# s by which what the car reports stands behind motion capture. Two things say so: the gyroscope
-# shows a turn 0.05 s after it (rms 0.07 rad/s there, 0.16 to 0.41 at 0.09 s), far more than such a
-# part takes; and in the logs with motion capture a motor that answers its command at once comes too
-# late, while in the straight steps, where all is on the car's clock, it takes 0.035 s.
-BEHIND = 0.045
-
 FASTEST, FASTEST_YAW = 10.0, 60.0  # m/s, rad/s; a frame that would need more is a false one
 SLACK, SLACK_YAW = 0.02, 0.1  # m, rad; noise that no speed is concluded from
 DIGITS = 6  # of a second that times keep
@@ -120,7 +114,6 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
         "repairs": repairs,
     }
     if found.truth is not None:
-        about["capture_lead_s"] = BEHIND if CLOCK in table else 0.0
         about["capture_point"] = (
             {"x_m": POINT_X, "y_m": POINT_Y, "heading_rad": YAW_ERROR}
             if CLOCK in table
@@ -184,7 +177,7 @@ def _recording(log: Path, table: Table) -> Log:
 
 
 def _captured(table: Table) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Motion capture at the centre of mass, on the car's clock; how many frames were dropped."""
+    """Motion capture at the centre of mass, and how many frames were dropped for what."""
     time = np.round(table["vicon time"] - table["vicon time"][0], DIGITS)
     x, y, yaw = (table[name] for name in CAPTURE[1:])
     pose = np.stack([x, y, yaw])
@@ -194,7 +187,7 @@ def _captured(table: Table) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     heading = np.unwrap(yaw[possible])
     cosine, sine = np.cos(heading + YAW_ERROR), np.sin(heading + YAW_ERROR)
     truth = {
-        "time_s": np.round(time[possible] + BEHIND, DIGITS),
+        "time_s": time[possible],
         "x_m": x[possible] - cosine * POINT_X + sine * POINT_Y,
         "y_m": y[possible] - sine * POINT_X - cosine * POINT_Y,
         "heading_rad": heading + YAW_ERROR,

@@ -40,6 +40,7 @@ class Shots(NamedTuple):
     throttle: Array  # (windows, ticks from `BEFORE` on), asked for
     steering: Array
     measured: Array  # (windows, quantities, samples after the start); NaN: not known
+    weight: Array  # of the window in a fit
 
 
 def joined(parts: Sequence[Shots]) -> Shots:
@@ -96,6 +97,7 @@ def take(
         throttle,
         steering,
         np.stack(seen, axis=1),
+        np.ones(len(starts)),
     )
     known = np.isfinite(vx + vy + yaw_rate)
     if not known.any():
