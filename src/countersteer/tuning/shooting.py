@@ -40,6 +40,7 @@ class Shots(NamedTuple):
     throttle: Array  # (windows, ticks from `BEFORE` on), asked for
     steering: Array
     measured: Array  # (windows, quantities, samples after the start); NaN: not known
+    weight: Array  # of the window in a fit
 
 
 def joined(parts: Sequence[Shots]) -> Shots:
@@ -47,8 +48,10 @@ def joined(parts: Sequence[Shots]) -> Shots:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def take(run: Run, car: Car, surface: int, horizon: float, every: float, dt: float) -> Shots | None:
-    """The windows of a run, `every` seconds; None where there are none.
+def take(
+    run: Run, car: Car, surface: int, horizon: float, every: float, dt: float
+) -> tuple[Shots, np.ndarray] | None:
+    """The windows of a run, `every` seconds, and when they start; None where there are none.
 
     They are those that `replay --compare` judges by; the car serves for what is known of it: its
     radii, and which quantities its readings are.
@@ -98,9 +101,12 @@ def take(run: Run, car: Car, surface: int, horizon: float, every: float, dt: flo
         throttle,
         steering,
         np.stack(seen, axis=1),
+        np.ones(len(starts)),
     )
     known = np.isfinite(vx + vy + yaw_rate)
-    return jax.tree.map(lambda leaf: leaf[known], shots) if known.any() else None
+    if not known.any():
+        return None
+    return jax.tree.map(lambda leaf: leaf[known], shots), time[known]
 
 
 def predict(car: Car, shot: Shots, dt: float) -> Array:

@@ -25,6 +25,7 @@ FEWEST = 5  # echoes on a line: two lay it, three more say that it is one
 SPIKE = 3.0  # standard deviations off its line, beyond which an echo is of something else
 ROUNDS = 5  # of telling spikes by the spread and the spread by what is no spike
 RESOLVED = 1e-3  # m; no sonar tells less
+LIKE_MEAN = 0.6  # a line's slope weighs the speed by a parabola, of 3/5 of a flat mean's variance
 TO_DEVIATION = 1.4826  # a normal variable's standard deviation over its median magnitude
 
 
@@ -35,6 +36,7 @@ class Speed(NamedTuple):
     value: np.ndarray  # m/s; forward and backward alike for the encoder and for lines
     deviation: np.ndarray  # m/s; one standard deviation. Where two values meet, at a count or a
     # line, one's error is in part the other's with its sign turned; else errors are independent.
+    over: np.ndarray  # s; the time about `time` that the value is the mean over
 
 
 def read_speed(run: Run, source: str) -> Speed:
@@ -57,7 +59,7 @@ def from_encoder(run: Run) -> Speed:
     window = np.diff(time)
     quantum = _quantum(run, speed)
     deviation = np.full(len(window), quantum * ROUNDED_TWICE)
-    return Speed(time[1:] - window / 2, speed[1:], deviation)
+    return Speed(time[1:] - window / 2, speed[1:], deviation, window)
 
 
 def from_sonar(run: Run) -> Speed:
@@ -89,7 +91,12 @@ def from_sonar(run: Run) -> Speed:
             raise InputError(f"{run.path}/telemetry.csv: sonar_front_m never follows a wall ahead")
         spread = max(math.sqrt(squares / free), RESOLVED)
     found = [
-        (np.mean(t[k]), -line[0], spread / (np.std(t[k]) * math.sqrt(np.sum(k))))
+        (
+            np.mean(t[k]),
+            -line[0],
+            spread / (np.std(t[k]) * math.sqrt(np.sum(k))),
+            math.sqrt(LIKE_MEAN) * np.ptp(t[k]),
+        )
         for (t, _, least), line, k in zip(windows, lines, kept, strict=True)
         if np.sum(k) >= least
     ]
@@ -122,7 +129,7 @@ def from_lines(run: Run) -> Speed:
     took = np.diff(time)
     speed = spacing * np.diff(counts) / took
     middle = time[1:] - (took + row) / 2
-    return Speed(middle, speed, speed / took * row * ROUNDED_TWICE)
+    return Speed(middle, speed, speed / took * row * ROUNDED_TWICE, took)
 
 
 READERS: dict[str, Callable[[Run], Speed]] = {
@@ -142,9 +149,10 @@ def _reported(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
 def _quantum(run: Run, speed: np.ndarray) -> float:
     """Speed of one count in a window (m/s)."""
     counts = readings(run, "encoder_counts")[1]
-    passed = np.diff(counts) if len(counts) == len(speed) else np.zeros(0)
-    if np.any(passed > 0):
-        return float(np.median(speed[1:][passed > 0] / passed[passed > 0]))
+    passed = np.diff(counts) if len(counts) == len(speed) else np.zeros(len(speed) - 1)
+    told = (passed > 0) & (speed[1:] > 0)  # one of the two may be stuck
+    if np.any(told):
+        return float(np.median(speed[1:][told] / passed[told]))
     steps = np.diff(np.unique(np.append(speed, 0.0)))
     steps = steps[steps > FINEST]
     if not len(steps):

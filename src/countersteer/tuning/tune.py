@@ -1,0 +1,302 @@
+"""`tune`: runs in, a car and what it is worth out."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import tomli_w
+
+from countersteer.car.car import Car
+from countersteer.car.files import save_car
+from countersteer.car.parameter import EDGE, changed
+from countersteer.errors import InputError
+from countersteer.runs.faults import Fault, faults, refuse, repaired
+from countersteer.runs.run import Run
+from countersteer.tuning import fit, shooting
+from countersteer.tuning.fit import FLOOR, Fitted, Result
+from countersteer.tuning.shooting import QUANTITIES, Shots
+
+EVERY = {"fitted": 0.5, "judged": 0.25}  # s between the starts of windows
+CHANGES = np.array([0.3, 0.3, 1.0])  # of vx, vy, yaw rate, that make a window transient
+
+
+class Logs(NamedTuple):
+    """Windows of runs, with the run and the time of each."""
+
+    runs: list[Run]
+    masked: list[str]  # what was left out or mended, in words
+    shots: Shots
+    run: np.ndarray
+    start: np.ndarray
+
+    def where(self, chosen: np.ndarray) -> "Logs":
+        """Some of the windows."""
+        shots = jax.tree.map(lambda leaf: leaf[chosen], self.shots)
+        return self._replace(shots=shots, run=self.run[chosen], start=self.start[chosen])
+
+
+def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: str) -> Logs:
+    """The windows of runs without what is false in them.
+
+    Raises `InputError` naming the run where it cannot be used at all.
+    """
+    clean, masks, words = [], [], []
+    for run in runs:
+        refuse(run)
+        mended, said = repaired(run)
+        found = faults(mended)
+        clean.append(mended)
+        masks.append(found)
+        words += [f"{run.path.name}: {line}" for line in said] + [_said(run, f) for f in found]
+    surfaces = [surface_of(run, cars, base) for run in clean]
+    shots, of_run, start = fit.take_shots(clean, dict(cars), surfaces, masks, every)
+    return Logs(clean, words, shots, of_run, start)
+
+
+def _said(run: Run, fault: Fault) -> str:
+    return f"{run.path.name}: {fault.start:.1f} to {fault.end:.1f} s: {fault.what}"
+
+
+def surface_of(run: Run, cars: Mapping[str, Car], base: str) -> str:
+    """The surface that a run was driven on: the car that its `run.toml` names, or the base."""
+    name = str(run.about.get("car_name", base))
+    return name if name in cars else base
+
+
+def by_surface(base: str, car: Car, others: Mapping[str, Car]) -> dict[str, Car]:
+    """A car for each surface: the base, with what belongs to the floor from the others."""
+    cars = {base: car}
+    for name, other in others.items():
+        cars[name] = car
+        for path in FLOOR:
+            cars[name] = changed(cars[name], path, np.float64(fit.value_of(other, path)))
+    return cars
+
+
+def tune(
+    logs: Logs,
+    cars: dict[str, Car],
+    what: str,
+    hold_out: bool,
+    validation: Logs | None,
+    report: Callable[[str], None],
+) -> tuple[Result, dict[str, Any], list[tuple[str, Logs]]]:
+    """Fit, and judge on what was not fitted. Returns the fit, its JSON, and the windows by kind.
+
+    With `hold_out`, blocks of the logs' own time are kept back (`fit.blocks`).
+    """
+    began = time.monotonic()
+    parts = [("fitted", logs)]
+    if hold_out:
+        kind = fit.blocks(logs.start)
+        if not ((kind == 1).any() and (kind == 2).any()):
+            raise InputError("too little data to hold a part out: give --validate, or --hold-out 0")
+        parts = [("fitted", logs.where(kind == 1)), ("held out", logs.where(kind == 2))]
+    if validation is not None:
+        parts.append(("validation", validation))
+    fitted = parts[0][1]
+    thin = fitted.where(thinned(fitted.start, EVERY["fitted"]))
+    result = fit.fit(cars, thin.shots, what, thin.run, report)
+    runs: list[dict[str, Any]] = []
+    totals: dict[str, Any] = {}
+    for title, part in parts:
+        totals[title] = {}
+        for number, name in enumerate(cars):
+            chosen = part.shots.surface == number
+            if chosen.any():
+                totals[title][name] = judged(result.cars, part.where(chosen).shots)
+        for i, run in enumerate(part.runs):
+            chosen = part.run == i
+            if chosen.any():
+                shots = part.where(chosen).shots
+                surface = list(cars)[int(shots.surface[0])]
+                entry = {"run": run.path.name, "surface": surface, "kind": title}
+                runs.append(entry | judged(result.cars, shots))
+    about: dict[str, Any] = {
+        "fit": what,
+        "seconds": round(time.monotonic() - began, 1),
+        "surfaces": list(cars),
+        "parameters": [told(one) for one in result.fitted],
+        "not_determined": sorted({f.path for f in result.fitted if not f.determined}),
+        "at_bounds": sorted({f.path for f in result.fitted if f.at_bound}),
+        "runs": runs,
+        "totals": totals,
+        "masked": logs.masked,
+        "evaluations": result.evaluations,
+        "cost": result.cost,
+    }
+    return result, about, parts
+
+
+def thinned(start: np.ndarray, every: float) -> np.ndarray:
+    """Windows at multiples of `every`, and those that start at any other instant (an onset)."""
+    regular = np.abs(start / EVERY["judged"] - np.rint(start / EVERY["judged"])) < 1e-3
+    kept = np.abs(start / every - np.rint(start / every)) < 1e-3
+    return kept | ~regular
+
+
+def transient(shots: Shots) -> np.ndarray:
+    """Windows in which the motion changes by as much as `CHANGES`; without capture, the wheels."""
+    start = np.stack([*shots.velocity], axis=1)[:, :, None]
+    change = np.abs(shots.measured[:, :3] - start)
+    wheels = np.abs(shots.measured[:, 3] - shots.wheel_speed[:, None])
+    captured = np.isfinite(shots.measured[:, 0]).any(axis=1)
+    lively = np.nan_to_num(change) > CHANGES[:, None]
+    return np.where(
+        captured, lively.any(axis=(1, 2)), (np.nan_to_num(wheels) > CHANGES[0]).any(axis=1)
+    )
+
+
+def judged(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
+    """Errors over some windows, and over those of them in which something changes."""
+    found = fit.errors(cars, shots)
+    lively = transient(shots)
+    whole = {"windows": found["windows"], "errors": found["simulated"]}
+    whole["persistence"] = found["persistence"]
+    whole["transient"] = {"windows": int(lively.sum())}
+    if lively.any():
+        some = fit.errors(cars, jax.tree.map(lambda leaf: leaf[lively], shots))
+        whole["transient"] |= {"errors": some["simulated"], "persistence": some["persistence"]}
+    return whole
+
+
+def told(one: Fitted) -> dict[str, Any]:
+    """A fitted parameter in the units of files."""
+    declared = fit.declaration(one.path)
+    suffix, factor = EDGE[declared.unit]
+    return {
+        "path": one.path + suffix,
+        "surface": one.surface,
+        "unit": suffix.lstrip("_"),
+        "prior": one.before / factor,
+        "value": one.value / factor,
+        "deviation": one.deviation / factor,
+        "by_curvature": one.by_curvature / factor,
+        "by_halves": one.by_halves / factor,
+        "determined": one.determined,
+        "at_bound": one.at_bound,
+    }
+
+
+def series(cars: dict[str, Car], parts: Sequence[tuple[str, Logs]]) -> list[dict[str, Any]]:
+    """What a page draws: each run as measured, with the windows simulated in it."""
+    drawn: dict[str, dict[str, Any]] = {}
+    for kind, part in parts:
+        problem = fit.Problem(cars, part.shots, ())
+        table = problem.table[part.shots.surface]
+        found = fit.in_lanes(fit.predicted, problem.base, table, part.shots)
+        steps = shooting.SAMPLE * np.arange(1, part.shots.measured.shape[-1] + 1)
+        for i, run in enumerate(part.runs):
+            rows = np.flatnonzero(part.run == i)
+            if not len(rows):
+                continue
+            entry = drawn.setdefault(
+                run.path.name,
+                {
+                    "run": run.path.name,
+                    "surface": list(cars)[int(part.shots.surface[rows[0]])],
+                    "kind": kind,
+                    "quantities": [
+                        {"name": q, "time": [], "measured": [], "windows": []} for q in QUANTITIES
+                    ],
+                    "commands": {
+                        "time": run.commands["time_s"],
+                        "throttle": run.commands["throttle"],
+                        "steering_deg": np.degrees(run.commands["steering"]),
+                    },
+                },
+            )
+            for row in rows:
+                times = part.start[row] + steps
+                for j, quantity in enumerate(entry["quantities"]):
+                    quantity["time"].append(times)
+                    quantity["measured"].append(part.shots.measured[row, j])
+                    quantity["windows"].append(
+                        {
+                            "time": times,
+                            "simulated": found[row, j],
+                            "held_out": kind != "fitted",
+                        }
+                    )
+    for entry in drawn.values():
+        for quantity in entry["quantities"]:
+            times = np.concatenate(quantity["time"])
+            order = np.unique(np.round(times, 4), return_index=True)[1]
+            quantity["measured"] = np.concatenate(quantity["measured"])[order]
+            quantity["time"] = times[order]
+        entry["quantities"] = [q for q in entry["quantities"] if np.isfinite(q["measured"]).any()]
+    return list(drawn.values())
+
+
+def residuals(cars: dict[str, Car], logs: Logs, most: int = 3000) -> dict[str, Any]:
+    """Normalised residuals by quantity, at most so many of each."""
+    problem = fit.Problem(cars, logs.shots, ())
+    found = fit.in_lanes(fit.predicted, problem.base, problem.table[logs.shots.surface], logs.shots)
+    result = {}
+    for i, quantity in enumerate(QUANTITIES):
+        off = ((found - logs.shots.measured)[:, i] / fit.SCALES[i]).ravel()
+        off = off[np.isfinite(off)]
+        if len(off):
+            values = off[:: max(1, len(off) // most)].tolist()
+            result[quantity] = {"scale": float(fit.SCALES[i]), "values": values}
+    return result
+
+
+def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Path]:
+    """The cars as files: the first in full, the others beside it with what their floor changes."""
+    names = list(result.cars)
+    files = {names[0]: out} | {name: out.with_name(f"{name}.toml") for name in names[1:]}
+    source = {"fit": f"countersteer tune --fit {about['fit']} --car {about.get('car', names[0])}"}
+    runs = sorted({run["run"] for run in about["runs"] if run["kind"] != "validation"})
+    source["logs"] = ", ".join(runs)
+    for name, path in files.items():
+        said = source | {
+            kind.replace(" ", "_"): _errors(totals[name])
+            for kind, totals in about["totals"].items()
+            if name in totals
+        }
+        if about["not_determined"]:
+            said["not_determined"] = ", ".join(about["not_determined"]) + ": left as they were"
+        if name == names[0]:
+            save_car(result.cars[name], path, said)
+            continue
+        tables: dict[str, Any] = {"base": out.name, "source": said}
+        for path_inside in FLOOR:
+            *rooms, key = path_inside.split(".")
+            suffix, factor = EDGE[fit.declaration(path_inside).unit]
+            table = tables
+            for room in rooms:
+                table = table.setdefault(room, {})
+            table[key + suffix] = fit.value_of(result.cars[name], path_inside) / factor
+        path.write_text(tomli_w.dumps(tables))
+    return files
+
+
+def _errors(total: dict[str, Any]) -> str:
+    """Median errors after a window, as a text."""
+    said = ", ".join(
+        f"{quantity} {entry['median_abs_error']:.3f}" for quantity, entry in total["errors"].items()
+    )
+    return f"median error after {fit.HORIZON:g} s in {total['windows']} windows: {said}"
+
+
+def table_lines(about: dict[str, Any]) -> list[str]:
+    """What a terminal shows: errors by surface, and the parameters."""
+    lines = []
+    for kind, totals in about["totals"].items():
+        for surface, total in totals.items():
+            lines.append(f"{kind}, {surface}: {total['windows']} windows (if nothing changed)")
+            for quantity, entry in total["errors"].items():
+                still = total["persistence"].get(quantity, {}).get("median_abs_error", np.nan)
+                error = entry["median_abs_error"]
+                lines.append(f"  {quantity:18} {error:7.3f}  ({still:.3f})")
+    for one in about["parameters"]:
+        flag = "" if one["determined"] else "  not determined: left"
+        flag += "  at its bound" if one["at_bound"] else ""
+        name = one["path"] + (f" ({one['surface']})" if one["surface"] else "")
+        change = f"{one['prior']:10.4g} -> {one['value']:10.4g} ± {one['deviation']:.2g}"
+        lines.append(f"  {name:52} {change}{flag}")
+    return lines

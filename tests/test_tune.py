@@ -1,0 +1,201 @@
+"""Fits: a known car found again from its logs, derivatives, and what is left out of a fit."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from countersteer.car.files import load_car
+from countersteer.car.parameter import changed
+from countersteer.cli import main
+from countersteer.errors import InputError
+from countersteer.runs.files import COMMANDS, TableWriter, command_rows
+from countersteer.runs.run import Run, read_run
+from countersteer.tuning import fit, shooting, tune
+
+TRUE = {
+    "tires.front.friction": 0.45,
+    "tires.rear.friction": 0.36,
+    "body.yaw_inertia": 0.009,
+    "motor.resistance": 1.1,
+    "drivetrain.drag": 0.05,
+}
+
+
+def write_commands(path: Path, time: np.ndarray, throttle: np.ndarray, steering: np.ndarray):
+    table = TableWriter(path, COMMANDS)
+    table.write(command_rows(time, throttle, steering))
+    table.close()
+
+
+def drives(folder: Path) -> list[Run]:
+    """Logs of a car that nobody knows: launches, circles, throttle taken off in full lock."""
+    rng = np.random.default_rng(3)
+    time = np.arange(0, 9, 0.05)
+    runs = []
+    for number in range(3):
+        blocks = np.floor(time / 1.5).astype(int)
+        throttle = np.where(time < 0.3, 0, rng.uniform(0.25, 0.9, 8)[blocks])
+        steering = np.radians(rng.uniform(-25, 25, 8)[blocks])
+        commands = folder / f"commands-{number}.csv"
+        write_commands(commands, time, throttle, steering)
+        out = folder / f"run-{number}"
+        settings = [f"--set={name}={value}" for name, value in outside(TRUE).items()]
+        arguments = ["replay", str(commands), "--car", "jetracer-tape", "--out", str(out)]
+        assert main([*arguments, *settings, "--seed", str(number), "--json"]) in (0, 1)
+        runs.append(read_run(out))
+    return runs
+
+
+def outside(changes: dict[str, float]) -> dict[str, float]:
+    """By the names of files."""
+    suffix = {"body.yaw_inertia": "_kgm2", "motor.resistance": "_ohm", "drivetrain.drag": "_nm"}
+    return {name + suffix.get(name, ""): value for name, value in changes.items()}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory) -> tuple[list[Run], dict]:
+    runs = drives(tmp_path_factory.mktemp("unknown"))
+    return runs, {"jetracer-tape": load_car("jetracer-tape")}
+
+
+@pytest.fixture(scope="module")
+def windows(logs) -> tune.Logs:
+    runs, cars = logs
+    return tune.read_logs(runs, cars, 0.5, "jetracer-tape")
+
+
+def test_the_true_car_predicts_its_logs(logs, windows):
+    _, cars = logs
+    true = cars["jetracer-tape"]
+    for name, value in TRUE.items():
+        true = changed(true, name, np.float64(value))
+    found = fit.errors({"jetracer-tape": true}, windows.shots)
+    guessed = fit.errors(cars, windows.shots)
+    for quantity, limit in (("vx_mps", 0.01), ("vy_mps", 0.01), ("yaw_rate_radps", 0.05)):
+        error = found["simulated"][quantity]["median_abs_error"]
+        assert error < limit, quantity
+        assert error < guessed["simulated"][quantity]["median_abs_error"] / 5, quantity
+
+
+def test_derivatives_are_those_of_the_simulation(logs, windows):
+    _, cars = logs
+    problem = fit.Problem(cars, windows.where(np.arange(len(windows.start)) < 6).shots, tuple(TRUE))
+    u = problem.prior.copy()
+    exact = problem.jacobian(u)
+    for j in range(len(u)):
+        step = np.zeros(len(u))
+        step[j] = 1e-5
+        sides = [problem.residuals(u + sign * step) for sign in (1, -1)]
+        slope = (sides[0] - sides[1]) / 2e-5
+        scale = np.max(np.abs(slope))
+        # Where a contact begins to slide the slope jumps: few of all samples may differ.
+        off = np.abs(exact[:, j] - slope) > 1e-3 * scale
+        assert np.mean(off) < 0.01, problem.parameters[j]
+        assert scale > 0
+
+
+def test_a_known_car_is_found_again_within_its_deviations(logs, windows):
+    _, cars = logs
+    problem = fit.Problem(cars, windows.shots, tuple(TRUE))
+    solved = problem.solve(problem.prior, 25)
+    deviation = fit.deviations(problem, solved)
+    for i, (name, value) in enumerate(TRUE.items()):
+        found = float(problem.outside(solved.x)[i])
+        assert abs(math.log(found / value)) < 3 * deviation[i], (name, found, value, deviation[i])
+        assert found == pytest.approx(value, rel=0.05), name
+
+
+def test_what_the_logs_do_not_tell_is_named_and_left(logs, windows):
+    _, cars = logs
+    report: list[str] = []
+    result = fit.believed(
+        cars,
+        cars,
+        windows.shots,
+        (*TRUE, "servo.limit_left", "motor.neutral_brake"),
+        windows.run,
+        0,
+        report.append,
+    )
+    by_path = {one.path: one for one in result.fitted}
+    for name, value in TRUE.items():
+        one = by_path[name]
+        assert one.determined, name
+        assert abs(one.value - value) < 3 * one.deviation, (name, one)
+        assert one.deviation >= one.by_curvature
+    loose = [one for one in result.fitted if not one.determined]
+    for one in loose:
+        assert one.value == pytest.approx(one.before), one
+        assert one.path in " ".join(report)
+
+
+def test_held_out_windows_share_no_instant_with_fitted_ones():
+    start = np.arange(0, 30, 0.25)
+    kind = fit.blocks(start)
+    instants = {
+        which: {round(float(t), 2) for s in start[kind == which] for t in np.arange(s, s + 1, 0.05)}
+        for which in (1, 2)
+    }
+    assert not instants[1] & instants[2]
+    assert 0.1 < np.mean(kind == 2) < 0.35
+
+
+def test_a_fault_takes_its_windows_out_of_a_fit(logs):
+    runs, cars = logs
+    telemetry = runs[0].telemetry
+    column = np.array(telemetry["wheel_speed_mps"])
+    during = (telemetry["time_s"] > 3) & (telemetry["time_s"] < 6)
+    column[during & np.isfinite(column)] = 1.234
+    stuck = dataclasses.replace(
+        runs[0], telemetry=type(telemetry)(dict(telemetry) | {"wheel_speed_mps": column})
+    )
+    found = tune.read_logs([stuck], cars, 0.5, "jetracer-tape")
+    assert any("stuck" in line or "encoder" in line for line in found.masked), found.masked
+
+
+def test_a_wrong_unit_is_refused_by_name(logs):
+    runs, cars = logs
+    truth = runs[0].truth
+    wrong = type(truth)(dict(truth) | {"heading_rad": np.degrees(truth["heading_rad"])})
+    with pytest.raises(InputError, match=r"run-0"):
+        tune.read_logs([dataclasses.replace(runs[0], truth=wrong)], cars, 0.5, "jetracer-tape")
+
+
+def test_the_command_writes_a_car_a_page_and_figures(logs, tmp_path, capsys):
+    runs, _ = logs
+    out = tmp_path / "found.toml"
+    paths = [str(run.path) for run in runs]
+    status = main(
+        ["tune", *paths, "--car", "jetracer-tape", "--fit", "handling", "--out", str(out), "--json"]
+    )
+    told = json.loads(capsys.readouterr().out)
+    assert status == 0
+    assert load_car(str(out)).tires.front.friction != load_car("jetracer-tape").tires.front.friction
+    assert {one["kind"] for one in told["runs"]} == {"fitted", "held out"}
+    held = told["totals"]["held out"]["jetracer-tape"]
+    assert held["persistence"]["vx_mps"]["median_abs_error"] > 0
+    assert Path(told["page"]).exists()
+    assert any(one["path"] == "body.yaw_inertia_kgm2" for one in told["parameters"])
+
+
+def test_no_window_is_one_line(tmp_path, capsys):
+    commands = tmp_path / "commands.csv"
+    time = np.arange(0, 1, 0.05)
+    write_commands(commands, time, 0 * time, 0 * time)
+    out = tmp_path / "still"
+    main(["replay", str(commands), "--out", str(out), "--json"])
+    capsys.readouterr()
+    assert main(["tune", str(out), "--out", str(tmp_path / "car.toml")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_late_line_is_interpolated_to_fractions_of_a_tick():
+    line = np.array([0.0, 0.0, 1.0, 1.0, 3.0])
+    with jax.enable_x64(True):
+        late = np.asarray(shooting._late(line, 0.5))
+    np.testing.assert_allclose(late, [0, 0, 0.5, 1.0, 2.0])
