@@ -16,7 +16,7 @@ from PIL import Image
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import declarations
-from countersteer.tuning import advice
+from countersteer.tuning import advice, fit
 from countersteer.viewing.tuning_page import write_tuning_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -361,3 +361,7 @@ def test_advice_is_about_parameters_that_a_car_has():
     for pattern in patterns:
         assert any(fnmatch(path, pattern) for path in declared()), pattern
     assert advice.log_for("sensors.gyroscope.lag") == advice.OTHER
+
+
+def test_there_is_advice_on_whatever_is_fitted():
+    assert [path for path in fit.PARAMETERS if advice.log_for(path) == advice.OTHER] == []
