@@ -76,9 +76,7 @@ def take(
             seen.append(np.full(after.shape, np.nan))
             continue
         reference = references[name]
-        seen.append(
-            reference.undone(after) if reference.sensor else reference.signal.at(after)
-        )
+        seen.append(reference.undone(after) if reference.sensor else reference.signal.at(after))
     wheels = references.get("wheel_speed_mps")
     nothing = np.full(len(starts), np.nan)
     mean = nothing if wheels is None else wheels.undone(time, resting)
@@ -88,9 +86,7 @@ def take(
         else Wheels(*[nothing] * 4)
     )
     before = round(BEFORE / dt)
-    throttle, steering = asked(
-        run.commands, starts[:, None] + np.arange(-before, ticks + 1), dt
-    )
+    throttle, steering = asked(run.commands, starts[:, None] + np.arange(-before, ticks + 1), dt)
     shots = Shots(
         np.full(len(starts), surface),
         Vector(vx, vy, yaw_rate),
@@ -166,8 +162,7 @@ def _start(car: Car, shot: Shots, angle: Scalar, duty: Scalar) -> Motion:
     hubs = [dot(roll, shot.velocity) for roll in rolls]
     slip = jnp.where(jnp.isnan(shot.wheel_speed), 0.0, shot.wheel_speed - sum(hubs) / 4)
     rims = [
-        jnp.where(jnp.isnan(rim), hub + slip, rim)
-        for rim, hub in zip(shot.rims, hubs, strict=True)
+        jnp.where(jnp.isnan(rim), hub + slip, rim) for rim, hub in zip(shot.rims, hubs, strict=True)
     ]
     wheels = Wheels(
         *(rim / tire.radius for rim, tire in zip(rims, planar.tires_by_wheel(car), strict=True))
