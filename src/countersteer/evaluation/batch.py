@@ -24,7 +24,8 @@ from countersteer.world.state import State
 
 LANES = 256  # cars of a block: enough for the loops' overhead, few enough for the caches
 # In a block each delay line has its slots first: each slot's lanes lie side by side.
-AXES = State(0, 1, 1, 0, 0, 0, 0, 0)
+MOTION: Any = 0  # an axis stands for all of a motion
+AXES = State(MOTION, 1, 1, 0, 0, 0, 0, 0)
 
 
 def flags(cores: int) -> str:
@@ -50,7 +51,7 @@ def flags(cores: int) -> str:
 
 
 def advance(
-    cars: Car, walls: Any, states: State, commands: Command, first: Any, dt: Any, ticks: int
+    cars: Car, walls: Any, states: State, commands: Command, first: Any, dt: float, ticks: int
 ) -> State:
     """A block of states after so many ticks, each with its own command; plain `vmap`.
 
@@ -74,17 +75,15 @@ def advance(
 
 
 def in_blocks(
-    ticks: int, lanes: int = LANES, cores: int | None = None
-) -> Callable[[Car, Any, State, Command, Any, Any], State]:
+    dt: float, ticks: int, lanes: int = LANES, cores: int | None = None
+) -> Callable[[Car, Any, State, Command, Any], State]:
     """`advance` in blocks of so many lanes, on so many of JAX's devices (all), compiled.
 
     The number of cars is a multiple of lanes times cores.
     """
     mesh = Mesh(np.array(jax.devices()[:cores]), ("core",))
 
-    def on_core(
-        cars: Car, walls: Any, states: State, commands: Command, first: Any, dt: Any
-    ) -> State:
+    def on_core(cars: Car, walls: Any, states: State, commands: Command, first: Any) -> State:
         varied = np.ndim(cars.body.mass) > 0
         inputs = (cars, states, commands) if varied else (None, states, commands)
         # A block's numbers are one array: that goes in and out of the loop in place.
@@ -105,7 +104,7 @@ def in_blocks(
 
     def whole(cars: Car, *others: Any) -> State:
         cut, same = PartitionSpec("core"), PartitionSpec()
-        specs = (cut if np.ndim(cars.body.mass) else same, same, cut, cut, same, same)
+        specs = (cut if np.ndim(cars.body.mass) else same, same, cut, cut, same)
         run = jax.shard_map(on_core, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
         last: State = run(cars, *others)
         return last

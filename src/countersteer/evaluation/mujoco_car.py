@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-import mujoco
+import mujoco  # type: ignore[import-untyped]  # it ships no types
 import numpy as np
 from mujoco import rollout
 

@@ -20,7 +20,8 @@ def cosine_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
     for part in QUARTER:
         angle = angle - quarters * part
     square = angle**2
-    cosine = sine = 0.0
+    cosine: Scalar = 0.0
+    sine: Scalar = 0.0
     for k in reversed(range(terms)):
         cosine = (-1) ** k / math.factorial(2 * k) + cosine * square
         sine = (-1) ** k / math.factorial(2 * k + 1) + sine * square
