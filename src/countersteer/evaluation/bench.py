@@ -513,8 +513,8 @@ def page(found: dict[str, Any], picture: str) -> str:
     text = [
         "# Speed",
         "",
-        "Made by `make bench`. All sides of a row of figures were measured in one run, in turns;",
-        "medians over the rounds, with the least and the most.",
+        "Made by `make bench`. All sides were measured in one run, taking turns; medians over the",
+        "rounds, with the least and the most.",
         "",
         f"{at['processor']}, {at['cores']} cores, {at['isa']}; Python {at['python']}, {versions}.",
         f"{at['date']}; the machine's load was {at['load_before']:.1f} before and "
@@ -585,8 +585,9 @@ def bounds(found: dict[str, Any], counted: dict[str, Any]) -> list[str]:
             f"{100 * reached / found['peak_flops_per_s']:.0f} % of what a product of matrices",
             f"reaches here ({found['peak_flops_per_s'] / 1e9:.0f} Gflop/s, all of it fused",
             f"multiply-adds), and {counted['bytes'] * speed / count / 1e9:.0f} GB/s a core between",
-            "registers and caches: **what bounds it is that traffic**, loads and stores between",
-            "kernels, rather than arithmetic, main memory or launches.",
+            f"registers and caches: {counted['bytes'] / 4 / counted['flops']:.2f} loads and stores",
+            "for each operation. So neither main memory nor launches bound it, but a core's own",
+            "instructions: the arithmetic, and loads and stores between kernels.",
         ]
     if found.get("planar_over_native"):
         text += [
@@ -612,17 +613,18 @@ def draw(found: dict[str, Any], file: Path) -> None:
     axes.plot(list(growth), list(growth.values()), "o-", color="#0069a8", label="planar batch")
     for name, label, colour in (
         ("native_steps_per_s", "the same equations as C", "#00694f"),
-        ("planar_plain_vmap_steps_per_s", "vmap alone, 2048 cars, one process", "#8a6d1a"),
+        ("planar_plain_vmap_steps_per_s", "vmap alone, 2,048 cars", "#8a6d1a"),
         ("mujoco_steps_per_s", "MuJoCo", "#a3210f"),
     ):
         if found.get(name):
             axes.axhline(found[name] / 1e6, color=colour, linestyle="--", linewidth=1, label=label)
     axes.set_xscale("log", base=2)
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xticks(list(growth), [f"{n:,}" for n in growth])
     axes.set(xlabel="cars", ylabel="million steps per second")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    axes.legend(fontsize="small", loc="center right")
     figure.savefig(file, dpi=110)
     pyplot.close(figure)
 
