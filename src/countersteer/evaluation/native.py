@@ -42,6 +42,17 @@ static inline V v_tanh(V a) {
 }
 """
 
+CHAINS = 12  # of fused multiply-adds that do not wait for each other
+PEAK = f"""
+void peak(float *out, long n) {{
+  V x[{CHAINS}];
+  for (int k = 0; k < {CHAINS}; k++) x[k] = v_float(out[k]);
+  for (long i = 0; i < n; i++)
+    for (int k = 0; k < {CHAINS}; k++) x[k] = x[k] * out[12] + out[13];
+  for (int k = 0; k < {CHAINS}; k++) out[k] = x[k][0];
+}}
+"""
+
 BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/", "add_any": "+", "and": "&", "or": "|"}
 BINARY |= {"rem": "%", "gt": ">", "lt": "<", "ge": ">=", "le": "<=", "eq": "==", "ne": "!="}
 # How a primitive is written: for one number, and for a vector.
@@ -219,6 +230,7 @@ class Native:
             *printer.inside,
             *(f"x[{k * count} + i] = {name};" for k, name in enumerate(flat)),
             "}}}}",
+            PEAK,
         ]
         with tempfile.TemporaryDirectory() as folder:
             source, library = Path(folder) / "step.c", Path(folder) / "step.so"
@@ -228,7 +240,8 @@ class Native:
                 subprocess.run(order, check=True, capture_output=True, timeout=COMPILE_TIME)
             except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
                 raise RuntimeError(f"the C compiler failed: {error}") from error
-            self._run = ctypes.CDLL(str(library)).run
+            code = ctypes.CDLL(str(library))
+        self._run, self._peak = code.run, code.peak
         self._threads = ThreadPoolExecutor(threads)
         batch = np.stack(
             [
@@ -261,3 +274,15 @@ class Native:
         ends = np.concatenate(list(self._threads.map(part, self._start)))
         whole: np.ndarray = ends.transpose(0, 2, 1).reshape(self.cars, -1)
         return whole
+
+    def peak(self, rounds: int) -> float:
+        """Does fused multiply-adds on all threads, and says how many operations that were."""
+        threads = len(self._start)
+
+        def part(_: int) -> None:
+            numbers = np.array([1.0] * CHAINS + [0.999, 0.001], np.float32)
+            pointer = numbers.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
+            self._peak(pointer, ctypes.c_long(rounds))
+
+        list(self._threads.map(part, range(threads)))
+        return 2.0 * WIDTH * CHAINS * rounds * threads
