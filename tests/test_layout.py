@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "runs": {"car", "course"},
     "evaluation": {
         "car", "course", "world", "sensing", "simulator", "runs",
+        "drivers",  # the bench times a drive, so it needs one that drives
     },
     "viewing": {"car", "runs", "simulator"},  # a car is drawn to its size
     "listing": {"car", "course"},

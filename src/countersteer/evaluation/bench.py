@@ -585,8 +585,8 @@ def bounds(found: dict[str, Any], counted: dict[str, Any]) -> list[str]:
             f"At {speed / 1e6:.1f} M steps/s that is {reached / 1e9:.0f} Gflop/s, "
             f"{100 * reached / found['peak_flops_per_s']:.0f} % of what chains of fused",
             f"multiply-adds reach here ({found['peak_flops_per_s'] / 1e9:.0f} Gflop/s),",
-            f"and {counted['bytes'] * speed / count / 1e9:.0f} GB/s a core between",
-            f"registers and caches: {counted['bytes'] / 4 / counted['flops']:.2f} loads and stores",
+            f"and {counted['bytes'] * speed / count / 1e9:.0f} GB/s a core between registers and",
+            f"caches: {counted['bytes'] / 4 / counted['flops']:.2f} loads and stores",
             "for each operation. So neither main memory nor launches bound it, but a core's own",
             "instructions: the arithmetic, and loads and stores between kernels.",
         ]
@@ -625,7 +625,7 @@ def draw(found: dict[str, Any], file: Path) -> None:
     axes.set_xticks(list(growth), [f"{n:,}" for n in growth])
     axes.set(xlabel="cars", ylabel="million steps per second")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small", loc="center right")
+    axes.legend(fontsize="small", loc="lower right", bbox_to_anchor=(1.0, 0.12))
     figure.savefig(file, dpi=110)
     pyplot.close(figure)
 
