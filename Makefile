@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; 
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: drive test check accuracy notebook clean
+.PHONY: drive test check accuracy bench notebook clean
 
 drive: $(READY)
 	$(BIN)/countersteer drive box
@@ -20,6 +20,9 @@ check: $(READY)
 
 accuracy: $(READY)
 	$(BIN)/python -m countersteer.evaluation.accuracy docs/accuracy.md
+
+bench: $(READY)
+	$(BIN)/countersteer bench --out docs/speed.md
 
 # Jupyter is some thirty packages: only who changes the notebook needs it.
 notebook: $(READY)

@@ -103,7 +103,8 @@ def test_a_known_car_is_found_again_within_its_deviations(logs, windows):
     _, cars = logs
     problem = fit.Problem(cars, windows.shots, tuple(TRUE))
     solved = problem.solve(problem.prior, 25)
-    deviation = fit.deviations(problem, solved)
+    deviation, determined = fit.deviations(problem, solved)
+    assert determined.all()
     for i, (name, value) in enumerate(TRUE.items()):
         found = float(problem.outside(solved.x)[i])
         assert abs(math.log(found / value)) < 3 * deviation[i], (name, found, value, deviation[i])

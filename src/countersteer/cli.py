@@ -247,6 +247,10 @@ def parser() -> Parser:
     )
     export.add_argument("--force", action="store_true", help="replace a file that is there")
 
+    bench = verb("bench", "speed, side by side with what it is compared to", run_bench)
+    bench.add_argument("--quick", action="store_true", help="under a minute, less exact")
+    bench.add_argument("--out", type=Path, metavar="FILE.md", help="a page of it, with its picture")
+
     lists = verb("list", "what there is by name", run_list)
     lists.add_argument(
         "what",
@@ -594,6 +598,20 @@ def run_export(options: argparse.Namespace) -> int:
     else:
         size = file.stat().st_size / 1e6
         print(f"{file}: {animation.count} frames, {animation.duration:.1f} s, {size:.1f} MB")
+    return DONE
+
+
+def run_bench(options: argparse.Namespace) -> int:
+    """`bench`."""
+    from countersteer.evaluation import bench
+
+    if options.out and (options.out.suffix != ".md" or not options.out.parent.is_dir()):
+        raise InputError(f"{options.out}: name a file .md in a folder that is there")
+    with Progress(options.json) as progress:
+        found = bench.measure(bench.QUICK if options.quick else bench.FULL, progress.show)
+    if options.out:
+        bench.write_page(found, options.out)
+    print(json.dumps(found) if options.json else "\n".join(bench.lines(found)))
     return DONE
 
 

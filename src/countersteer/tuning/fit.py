@@ -3,7 +3,7 @@
     minimise  sum over windows, quantities, samples of rho((predicted - measured) / scale)
               + sum over parameters of ((u - u_prior) / width)²
 
-where u is the logarithm of a parameter that is positive (itself for one that may have either sign)
+where u is the logarithm of a parameter, or itself for one that may be nothing or less
 and rho the soft L1 loss, so that a window in which the motion was caught at another instant counts
 no more than any. Derivatives are exact, through the simulator (`shooting.predict`); the solver is
 SciPy's trust-region reflective `least_squares`, which keeps the declared ranges.
@@ -35,7 +35,6 @@ STEP = 0.002  # s; the step's own error is then a hundredth of a log's
 HORIZON = 1.0  # s
 SCALES = np.array([0.05, 0.03, 0.12, 0.08])  # of the quantities: what a good fit is off by
 LOOSE = 0.5  # prior standard deviation of a logarithm, where there is none in `WIDTHS`
-TURNED = math.radians(2)  # prior standard deviation of an angle that may have either sign
 LANES = 64  # windows in a call of the compiled program, whatever their number
 GROUP = 8  # derivatives that a lane takes at once
 OUTLYING = 0.5  # normalised residual at which the loss turns linear
@@ -82,17 +81,19 @@ STEERING = (
 )
 HANDLING = ("body.yaw_inertia",)
 PARAMETERS = (*SPEEDS, *STEERING, *HANDLING, *TIRES)
-WIDTHS = {  # what is known beforehand, as the standard deviation of a logarithm
-    "body.yaw_inertia": 0.3,
-    "motor.delay": 1.0,
-    "motor.lag": 1.0,
-    "motor.neutral_brake": 1.0,
-    "motor.conduction": 1.0,
-    "motor.rotor_inertia": 0.7,
-    "drivetrain.drag_viscous": 1.0,
-    "servo.delay": 1.0,
-    "tires.front.sliding_ratio": 0.2,
-    "tires.rear.sliding_ratio": 0.2,
+WIDTHS = {"body.yaw_inertia": 0.3}  # known beforehand: standard deviation of a logarithm
+ABSOLUTE = {  # the same, of a parameter that may as well be next to nothing, in its own unit
+    "motor.conduction": 0.5,
+    "motor.neutral_brake": 0.2,
+    "motor.lag": 0.05,
+    "motor.delay": 0.03,
+    "motor.rotor_inertia": 2e-6,
+    "drivetrain.drag_viscous": 1e-4,
+    "servo.trim": math.radians(2),
+    "servo.lag": 0.05,
+    "servo.delay": 0.03,
+    "tires.front.sliding_ratio": 0.1,
+    "tires.rear.sliding_ratio": 0.1,
 }
 
 
@@ -256,7 +257,7 @@ class Problem:
             [[value_of(car, path) for path in PARAMETERS] for car in cars.values()]
         )
         declared = [declaration(p.path) for p in self.parameters]
-        self.logarithmic = np.array([d.low >= 0 for d in declared])
+        self.logarithmic = np.array([p.path not in ABSOLUTE for p in self.parameters])
         start = [self.table[p.surface or 0, PARAMETERS.index(p.path)] for p in self.parameters]
         self.prior = self.inside(np.array(start))
         lowest = np.array([d.low for d in declared])
@@ -265,13 +266,11 @@ class Problem:
             np.where(self.logarithmic, np.maximum(lowest, 1e-9 * self.high), lowest)
         )
         self.high = self.inside(self.high)
-        self.prior = np.clip(self.prior, self.low + 1e-9, self.high - 1e-9)
         self.width = np.array(
-            [
-                WIDTHS.get(p.path, LOOSE) if log else TURNED
-                for p, log in zip(self.parameters, self.logarithmic, strict=True)
-            ]
+            [ABSOLUTE.get(p.path, WIDTHS.get(p.path, LOOSE)) for p in self.parameters]
         )
+        margin = 1e-6 * self.width
+        self.prior = np.clip(self.prior, self.low + margin, self.high - margin)
 
     def inside(self, value: Array) -> Array:
         """From a parameter's value to the fit's variable."""
@@ -330,7 +329,7 @@ class Problem:
         """SciPy's result, from u."""
         return least_squares(
             self.residuals,
-            np.clip(u, self.low + 1e-9, self.high - 1e-9),
+            np.clip(u, self.low + 1e-6 * self.width, self.high - 1e-6 * self.width),
             jac=self.jacobian,
             bounds=(self.low, self.high),
             x_scale=self.width,
@@ -460,8 +459,7 @@ def believed(
     problem = Problem(cars, shots, free)
     u = problem.inside(values(problem, current))
     solved = problem.solve(u, PASSES)
-    curvature = deviations(problem, solved)
-    determined = curvature < KNOWN * problem.width
+    curvature, determined = deviations(problem, solved)
     if not determined.all():
         loose = [p for p, known in zip(problem.parameters, determined, strict=True) if not known]
         report("not determined: " + ", ".join(sorted({p.path for p in loose})))
@@ -473,7 +471,8 @@ def believed(
     evaluations += solved.nfev
     halves = by_halves(cars, shots, free, run_of, determined, solved.x)
     deviation = np.maximum(curvature, halves)
-    low, high = solved.x - problem.low < 1e-3, problem.high - solved.x < 1e-3
+    near = 1e-3 * problem.width
+    low, high = solved.x - problem.low < near, problem.high - solved.x < near
     rates = np.where(problem.logarithmic, problem.outside(solved.x), 1.0)
     start, end = problem.outside(problem.prior), problem.outside(solved.x)
     surfaces = list(cars)
@@ -487,7 +486,7 @@ def believed(
             float(rates[i] * curvature[i]),
             float(rates[i] * halves[i]),
             bool(determined[i]),
-            bool(low[i] or high[i]),
+            bool(determined[i] and (low[i] or high[i])),
         )
         for i, p in enumerate(problem.parameters)
     ]
@@ -505,17 +504,29 @@ class Held(Problem):
             setattr(self, name, getattr(whole, name)[free])
 
 
-def deviations(problem: Problem, solved: Any) -> np.ndarray:
-    """Standard deviations of the fit's variables by the curvature of its cost.
+def deviations(problem: Problem, solved: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations by the curvature of the cost, and which parameters are determined.
 
-    A window counts as one observation of each quantity (the residuals are divided so), and windows
-    overlap, so the noise is taken from the windows' mean square residuals, never less than one.
+    A window counts as one observation of each quantity (the residuals are divided so), and the
+    noise is taken from the windows' mean square residuals, never less than one. The parameter that
+    adds least to its prior is taken as known, and so on, until the data say something of each that
+    is left: of two that only their sum is known of, one is determined given the other.
     """
     hessian = solved.jac.T @ solved.jac
     data = solved.fun[: -len(problem.parameters)]
     observations = max(1, int(problem.known[:, :, -1].sum()))
     noise = max(1.0, float(np.sum(np.minimum(data**2, OUTLYING)) / observations))
-    return np.sqrt(noise * np.maximum(np.diag(np.linalg.pinv(hessian)), 0.0))
+    deviation = np.sqrt(noise * np.maximum(np.diag(np.linalg.pinv(hessian)), 0.0))
+    left = list(range(len(problem.parameters)))
+    while left:
+        some = np.sqrt(noise * np.diag(np.linalg.pinv(hessian[np.ix_(left, left)])))
+        worst = int(np.argmax(some / problem.width[left]))
+        deviation[left] = some
+        if some[worst] < KNOWN * problem.width[left[worst]]:
+            break
+        del left[worst]
+    determined = np.isin(np.arange(len(problem.parameters)), left)
+    return deviation, determined
 
 
 def by_halves(

@@ -34,10 +34,12 @@ import numpy as np
 from countersteer.car.car import Car, Wheels, wheel_positions
 from countersteer.car.parameter import Array, Scalar
 from countersteer.world import battery, chassis, drivetrain, motor, servo, tyre, walls
+from countersteer.world.angle import cosine_sine
 from countersteer.world.chassis import Symmetric, Vector, combine, dot, times
 from countersteer.world.state import Motion, State
 
 ROLL_OVER_TIME = 0.1  # s that a pair of wheels is in the air until the car counts as rolled over
+FEW = 32  # slots of a delay line that are read one by one
 TANGENT = Wheels(1.0, 1.0, 1.0, 1.0)
 GAMMA = 1 - math.sqrt(0.5)  # of the two-stage method
 TOUCH_TIME = 0.2  # s without contact after which the next one is a new touch
@@ -131,13 +133,19 @@ def delay(state: State, tick: Tick) -> tuple[State, Tick]:
 
 def _delayed(line: Array, now: Scalar, time: Scalar, tick: Tick) -> tuple[Array, Scalar]:
     slots = line.shape[0]
+    slot = jnp.arange(slots)
     # A choice by slot stays in place in a batch; an update by index would transpose it.
-    line = jnp.where(jnp.arange(slots) == tick.count % slots, jnp.asarray(now, line.dtype), line)
+    line = jnp.where(slot == tick.count % slots, jnp.asarray(now, line.dtype), line)
     ticks = jnp.clip(time / tick.dt, 0.0, slots - 2)
     whole = jnp.floor(ticks)
     newest = tick.count - whole.astype(jnp.int32)
     part = ticks - whole
-    return line, (1 - part) * line[newest % slots] + part * line[(newest - 1) % slots]
+    if slots > FEW:
+        return line, (1 - part) * line[newest % slots] + part * line[(newest - 1) % slots]
+    # A batch's look-ups are slow.
+    share = jnp.where(slot == newest % slots, 1 - part, 0.0)
+    share = jnp.where(slot == (newest - 1) % slots, part, share)
+    return line, sum(share[i] * line[i] for i in range(slots))
 
 
 def move(state: State, tick: Tick) -> tuple[State, Tick]:
@@ -165,7 +173,7 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
     end = loaded(car, follow(car, start, goal, h), start, combine(1.0, after, -1.0, before), h)
     turn = h * (start.yaw_rate + after.yaw) / 2
     angle = start.heading + h / 2 * start.yaw_rate
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    cosine, sine = cosine_sine(angle)
     forward, left = h * (before.x + after.x) / 2, h * (before.y + after.y) / 2
     after = rotated(after, h / 2 * after.yaw)
     motion = end._replace(

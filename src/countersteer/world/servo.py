@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from countersteer.car.car import Body, Servo
 from countersteer.car.parameter import Scalar
+from countersteer.world.angle import cosine_sine
 
 
 def target(servo: Servo, asked: Scalar) -> Scalar:
@@ -37,7 +38,8 @@ def directions(
     Ackermann's condition is cot(right) - cot(left) = track / wheelbase; a share of it is
     tan(side) = t / (1 -+ share t track / (2 wheelbase)) with t = tan(steering).
     """
-    tangent = jnp.tan(steering)
+    cosine, sine = cosine_sine(steering)
+    tangent = sine / cosine
     spread = servo.ackermann * tangent * body.track / (2 * body.wheelbase)
 
     def direction(t: Scalar) -> tuple[Scalar, Scalar]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from countersteer.car.car import Body
 from countersteer.car.parameter import Scalar
+from countersteer.world.angle import cosine_sine
 from countersteer.world.state import Motion
 
 FAR = 1e5  # m
@@ -99,7 +100,7 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     else it is the deepest end of the segment. The car is moved out along the normal, and a contact
     that approaches takes an impulse (`impulse`).
     """
-    cosine, sine = jnp.cos(motion.heading), jnp.sin(motion.heading)
+    cosine, sine = cosine_sine(motion.heading)
 
     def to_body(wall: Wall) -> Wall:
         dx, dy = wall.x - motion.x, wall.y - motion.y

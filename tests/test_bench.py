@@ -1,0 +1,80 @@
+"""The bench: its batch is the same physics, and its answer has what it promises."""
+
+import json
+import os
+import subprocess
+import sys
+from functools import partial
+
+import jax
+import numpy as np
+
+from countersteer import cli
+from countersteer.evaluation import batch, bench
+from countersteer.evaluation.native import Native
+
+TICKS = 10
+TINY = bench.Size(rounds=1, least=0.0, cars=8, ticks=TICKS, growth=(8,), warms=0, variants=False)
+# The batch in blocks, with the flags that are a process's own; what the lanes end with.
+IN_BLOCKS = f"""
+import os, sys
+import numpy as np
+from countersteer.evaluation import batch, bench
+os.environ["XLA_FLAGS"] = batch.flags(2)
+import jax
+from countersteer.simulator import keep_programs
+keep_programs()
+for varied in (False, True):
+    fleet = bench.Fleet(128, 2, varied=varied, block=32)
+    assert fleet.cars == 128
+    program = fleet.compiled(batch.in_blocks(bench.DT, {TICKS}, lanes=32))
+    ends = np.stack([np.asarray(leaf) for leaf in jax.tree.leaves(program(*fleet.inputs()).motion)])
+    np.save(sys.argv[1 + varied], ends)
+"""
+
+
+def test_a_batch_in_blocks_on_two_cores_is_what_vmap_gives(tmp_path):
+    files = [tmp_path / "same.npy", tmp_path / "varied.npy"]
+    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    subprocess.run([sys.executable, "-c", IN_BLOCKS, *files], check=True, env=environment)
+    with jax.enable_x64(False):
+        advance = jax.jit(partial(batch.advance, dt=bench.DT, ticks=TICKS))
+        for varied, file in enumerate(files):
+            fleet = bench.Fleet(128, 1, varied=bool(varied), block=64)
+            plain = advance(*fleet.inputs()).motion
+            expected = np.stack([np.asarray(leaf) for leaf in jax.tree.leaves(plain)])
+            found = np.load(file)
+            assert found.shape == expected.shape
+            assert np.ptp(expected, axis=1).max() > 1  # the lanes differ
+            # The loads' accelerations are a change of speed over 1 ms: rounding a thousandfold.
+            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
+
+
+def test_the_c_that_is_printed_from_jax_is_the_same_physics():
+    with jax.enable_x64(False):
+        fleet = bench.Fleet(64, 1, block=64)
+        advance = jax.jit(partial(batch.advance, dt=bench.DT, ticks=TICKS))
+        plain = jax.tree.leaves(advance(*fleet.inputs()).motion)
+        ends = Native(fleet, 2).run(TICKS)
+    for k, leaf in enumerate(plain):
+        np.testing.assert_allclose(ends[:, k], leaf, rtol=1e-3, atol=1e-3)
+
+
+def test_bench_gives_its_figures_and_a_page(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(bench, "QUICK", TINY)
+    page = tmp_path / "speed.md"
+    assert cli.main(["bench", "--quick", "--json", "--out", str(page)]) == cli.DONE
+    found = json.loads(capsys.readouterr().out)
+    for name in ("planar_batch_steps_per_s", "mujoco_steps_per_s", "drive_realtime_factor"):
+        assert found[name] > 0
+    assert {"drive_warm_s", "drive_cold_s"} <= found.keys()
+    assert found["planar_over_mujoco"] > 0
+    assert found["profile"]["flops"] > 1000
+    text = page.read_text()
+    assert "MuJoCo, all cores" in text
+    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_bench_wants_a_page_it_can_write(capsys):
+    assert cli.main(["bench", "--out", "speed.txt"]) == cli.WRONG_INPUT
+    assert "speed.txt" in capsys.readouterr().err
