@@ -203,7 +203,7 @@ def parser() -> Parser:
         type=number(0, 1, int),
         default=None,
         metavar="0|1",
-        help="1: keep every third block of 3 s of each run back and judge on it (default 1 "
+        help="1: keep every third block of 2 s of each run back and judge on it (default 1 "
         "without --validate)",
     )
     tune.add_argument(

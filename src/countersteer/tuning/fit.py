@@ -44,7 +44,7 @@ KNOWN = 0.7  # part of the prior's width under which a parameter counts as deter
 STRAIGHT = math.radians(4)  # steering under which a window is straight
 SLIDES = math.radians(10)  # sideslip from which it slides
 SPINS = 0.5  # m/s of wheel speed over the ground's from which it slides too
-HELD_OUT = 3.0  # s of each block that is fitted or held out by turns
+HELD_OUT = 2.0  # s of each block that is fitted or held out by turns
 
 ROLLING = ("drivetrain.drag", "drivetrain.drag_viscous")
 TIRES = (

@@ -168,7 +168,7 @@ def told(one: Fitted) -> dict[str, Any]:
     declared = fit.declaration(one.path)
     suffix, factor = EDGE[declared.unit]
     return {
-        "path": one.path + suffix,
+        "path": one.path,
         "surface": one.surface,
         "unit": suffix.lstrip("_"),
         "prior": one.before / factor,
@@ -296,7 +296,8 @@ def table_lines(about: dict[str, Any]) -> list[str]:
     for one in about["parameters"]:
         flag = "" if one["determined"] else "  not determined: left"
         flag += "  at its bound" if one["at_bound"] else ""
-        name = one["path"] + (f" ({one['surface']})" if one["surface"] else "")
+        unit = f"_{one['unit']}" if one["unit"] else ""
+        name = one["path"] + unit + (f" ({one['surface']})" if one["surface"] else "")
         change = f"{one['prior']:10.4g} -> {one['value']:10.4g} ± {one['deviation']:.2g}"
         lines.append(f"  {name:52} {change}{flag}")
     return lines
