@@ -2,16 +2,17 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from functools import partial
 
 import jax
 import numpy as np
+import pytest
 
 from countersteer import cli
 from countersteer.evaluation import batch, bench
-from countersteer.evaluation.native import Native
 
 TICKS = 10
 TINY = bench.Size(rounds=1, least=0.0, cars=8, ticks=TICKS, growth=(8,), warms=0, variants=False)
@@ -50,14 +51,31 @@ def test_a_batch_in_blocks_on_two_cores_is_what_vmap_gives(tmp_path):
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
 
 
-def test_the_c_that_is_printed_from_jax_is_the_same_physics():
-    with jax.enable_x64(False):
-        fleet = bench.Fleet(64, 1, block=64)
-        advance = jax.jit(partial(batch.advance, dt=bench.DT, ticks=TICKS))
-        plain = jax.tree.leaves(advance(*fleet.inputs()).motion)
-        ends = Native(fleet, 2).run(TICKS)
-    for k, leaf in enumerate(plain):
-        np.testing.assert_allclose(ends[:, k], leaf, rtol=1e-3, atol=1e-3)
+# In a process of its own: it loads code that was compiled a moment ago.
+AS_C = f"""
+from functools import partial
+import sys
+import numpy as np
+from countersteer.simulator import keep_programs
+keep_programs()
+import jax
+from countersteer.evaluation import batch, bench
+from countersteer.evaluation.native import Native
+fleet = bench.Fleet(64, 1, block=64)
+advance = jax.jit(partial(batch.advance, dt=bench.DT, ticks={TICKS}))
+plain = np.stack([np.asarray(leaf) for leaf in jax.tree.leaves(advance(*fleet.inputs()).motion)])
+np.save(sys.argv[1], plain)
+np.save(sys.argv[2], Native(fleet, 2).run({TICKS})[:, :len(plain)].T)
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_the_c_that_is_printed_from_jax_is_the_same_physics(tmp_path):
+    files = [tmp_path / "plain.npy", tmp_path / "c.npy"]
+    subprocess.run([sys.executable, "-c", AS_C, *files], check=True)
+    plain, ends = (np.load(file) for file in files)
+    assert np.ptp(plain, axis=1).max() > 1
+    np.testing.assert_allclose(ends, plain, rtol=1e-3, atol=1e-3)
 
 
 def test_bench_gives_its_figures_and_a_page(monkeypatch, capsys, tmp_path):

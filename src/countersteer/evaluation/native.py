@@ -15,7 +15,9 @@ from countersteer.world import planar
 
 BLOCK = 64  # lanes whose numbers stay in registers and the first cache over all ticks
 WIDTH = 16  # lanes of a vector
-COMPILE = ("cc", "-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
+COMPILE = ("cc", "-O3", "-march=native", "-ffast-math", "-fPIC", "-c")
+# Apart from compiling: linked with -ffast-math, a library has the whole process flush denormals.
+LINK = ("cc", "-shared")
 COMPILE_TIME = 150  # s
 
 PRELUDE = """
@@ -235,9 +237,13 @@ class Native:
         with tempfile.TemporaryDirectory() as folder:
             source, library = Path(folder) / "step.c", Path(folder) / "step.so"
             source.write_text("\n".join(lines))
-            order = [*COMPILE, str(source), "-o", str(library), "-lm"]
+            compiled = str(Path(folder) / "step.o")
             try:
-                subprocess.run(order, check=True, capture_output=True, timeout=COMPILE_TIME)
+                for order in (
+                    [*COMPILE, str(source), "-o", compiled],
+                    [*LINK, compiled, "-o", str(library), "-lm"],
+                ):
+                    subprocess.run(order, check=True, capture_output=True, timeout=COMPILE_TIME)
             except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
                 raise RuntimeError(f"the C compiler failed: {error}") from error
             code = ctypes.CDLL(str(library))

@@ -251,8 +251,7 @@ class Problem:
         ]
         self.shots = shots
         self.known = np.isfinite(shots.measured)
-        root = math.sqrt(shots.measured.shape[-1])
-        self.divisor = SCALES[:, None] * root / np.sqrt(shots.weight)[:, None, None]
+        self.divisor = SCALES[:, None] * math.sqrt(shots.measured.shape[-1])
         self.table = np.array(
             [[value_of(car, path) for path in PARAMETERS] for car in cars.values()]
         )
@@ -408,7 +407,6 @@ def fit(
     data apart. Parameters that the logs do not determine are named and put back.
     """
     names = ORDER if what == "all" else (what,)
-    shots = shots._replace(weight=balanced(run_of))
     total = 0
     current = cars
     for name in names:
@@ -432,12 +430,6 @@ def fit(
         raise InputError(f"--fit {what}: no window of these runs tells of it")
     part = jax.tree.map(lambda leaf: leaf[chosen], shots)
     return believed(cars, current, part, stage.parameters, run_of[chosen], total, report)
-
-
-def balanced(run_of: np.ndarray) -> np.ndarray:
-    """Weights by which a log counts as the root of its length: long circles are much alike."""
-    _, which, counts = np.unique(run_of, return_inverse=True, return_counts=True)
-    return np.sqrt(np.mean(counts) / counts)[which]
 
 
 def values(problem: Problem, cars: dict[str, Car]) -> np.ndarray:

@@ -40,7 +40,6 @@ class Shots(NamedTuple):
     throttle: Array  # (windows, ticks from `BEFORE` on), asked for
     steering: Array
     measured: Array  # (windows, quantities, samples after the start); NaN: not known
-    weight: Array  # of the window in a fit
 
 
 def joined(parts: Sequence[Shots]) -> Shots:
@@ -97,7 +96,6 @@ def take(
         throttle,
         steering,
         np.stack(seen, axis=1),
-        np.ones(len(starts)),
     )
     known = np.isfinite(vx + vy + yaw_rate)
     if not known.any():

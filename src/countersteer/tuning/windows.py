@@ -387,8 +387,7 @@ def simulate(
         for piece in range(0, ticks, PIECE):
             count = np.arange(piece, piece + PIECE, dtype=np.int32)
             throttle, steering = asked(commands, starts[rows][None, :] + count[:, None], dt)
-            advance = _advance_one if size == 1 else _advance_batch
-            state, seen = advance(car, state, count, throttle, steering, dt)
+            state, seen = _advance_all(car, state, count, throttle, steering, dt)
             pieces.append(np.stack([np.asarray(q).T for q in seen]))
         whole = np.concatenate(pieces, axis=2)
         chunks.append(whole[:, : len(chosen), : ticks + 1])
@@ -410,12 +409,7 @@ def _advance(
     return jax.lax.scan(tick, states, (counts, Command(throttle, steering)))
 
 
-_advance_one = jax.jit(_advance, static_argnames="dt")
-# Without fusion a batch's program compiles in a third of the time and runs about as fast; a single
-# car's, which may be wanted for minutes of car time, would be six times slower.
-_advance_batch = jax.jit(
-    _advance, static_argnames="dt", compiler_options={"xla_disable_hlo_passes": "fusion"}
-)
+_advance_all = jax.jit(_advance, static_argnames="dt")
 
 
 def _seen(car: Car, motion: Motion) -> tuple[Any, ...]:
