@@ -17,7 +17,7 @@ from countersteer.drivers.driver import Command
 from countersteer.link.link import RADIO
 from countersteer.runs.files import read_commands, read_table
 from countersteer.runs.run import read_run
-from countersteer.simulator import Simulator
+from countersteer.simulator import Simulator, scan
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wall_follower.py"
 
@@ -214,3 +214,18 @@ def test_the_estimate_is_said_and_used(tmp_path, capsys):
     status, _ = drive(capsys, "drive", "box", "--estimate", "truth", "--out", out)
     assert status == 0
     assert read_run(out).about["estimate"] == "truth"
+
+
+def test_a_drive_is_one_program():
+    """A loop whose types change in its first piece would be traced and compiled twice."""
+    course, car = load_course("box"), load_car("rx7")
+    driver = drift_turn(course, car)
+    simulator = Simulator(course, car, driver)
+    plan = simulator.plan()
+    with jax.enable_x64(True):
+        around, loop = simulator.begin(plan)
+        before = jax.eval_shape(lambda loop: loop, loop)
+        after = jax.eval_shape(lambda loop: scan(plan, 2, car, around, driver, loop)[0], loop)
+    leaves = zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
+    for (path, a), b in leaves:
+        assert (a.dtype, a.weak_type) == (b.dtype, b.weak_type), path

@@ -212,7 +212,7 @@ def guarded(
     slope = gain - curvature
     part = jnp.clip((h * power - slope) / (2 * jnp.where(gains, curvature, 1.0)), 0.0, 1.0)
     limited = jax.tree.map(lambda b, d, a: jnp.where(gains, b + part * d, a), before, change, after)
-    return limited, jnp.where(gains, 1.0, 0.0)
+    return limited, jnp.asarray(gains, jnp.result_type(energy))
 
 
 def two_stages(
