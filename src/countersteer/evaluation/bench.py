@@ -35,7 +35,7 @@ class Size(NamedTuple):
 
     rounds: int = 7
     least: float = 0.3  # s that a measurement takes
-    cars: int = 8192
+    cars: int = 32768
     ticks: int = 100
     growth: tuple[int, ...] = (1, 8, 64, 512, 2048, 8192, 32768)
     warms: int = 3  # drives in a process of their own, after one with an empty cache
@@ -43,7 +43,7 @@ class Size(NamedTuple):
 
 
 FULL = Size()
-QUICK = Size(rounds=3, least=0.1, growth=(8192,), warms=1, variants=False)
+QUICK = Size(rounds=3, least=0.1, growth=(32768,), warms=1, variants=False)
 
 
 def cores() -> int:
