@@ -1,6 +1,7 @@
 """What the tests share: 64-bit floats, JAX's cache on disk, and programs that compile once."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -10,7 +11,12 @@ import pytest
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
-from countersteer.simulator import keep_programs
+from countersteer.course.course import Course
+from countersteer.drivers.replay import Replay
+from countersteer.evaluation.drive import about_run
+from countersteer.evaluation.drive import drive as write_drive
+from countersteer.runs.run import Run, read_run
+from countersteer.simulator import Simulator, keep_programs
 from countersteer.world import planar
 from countersteer.world.state import Motion, State
 
@@ -140,3 +146,24 @@ def drive_alone() -> Callable[..., Motion]:
 
     program = jax.jit(advance)
     return lambda *arguments: jax.tree.map(np.asarray, program(*arguments))
+
+
+def step_run(
+    out: Path,
+    course: Course,
+    car: Car,
+    level: float,
+    seconds: float,
+    longest: float,
+    **more: object,
+) -> Run:
+    """A run of a throttle from rest, straight, and none after so many seconds."""
+    driver = Replay(
+        times=np.array([0.0, seconds]), throttle=np.array([level, 0.0]), steering=np.zeros(2)
+    )
+    simulator = Simulator(course, car, driver, **more)
+    out.mkdir()
+    write_drive(
+        simulator, out, about_run(simulator, "replay", "rx7", 1), 1, longest, lambda *_: None
+    )
+    return read_run(out)

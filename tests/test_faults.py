@@ -158,66 +158,70 @@ def with_velocities(run: Run) -> Run:
     return dataclasses.replace(run, truth=table)
 
 
+def stuck(
+    column: str, start: float, end: float, value: float, alone: bool = False
+) -> Callable[[Run], Run]:
+    """Makes a sensor report one value; alone: with no motion capture beside it."""
+
+    def broken(run: Run) -> Run:
+        run = changed(run, "telemetry", **{column: held(column, start, end, value)})
+        return without_truth(run) if alone else run
+
+    return broken
+
+
 # Each makes one fault in a good log. What must be found: words, column, and a time within it.
 FAULTS: dict[str, tuple[Callable[[Run], Run], str, str, float]] = {
     "encoder_stuck_at_rest": (
-        lambda r: changed(r, "telemetry", wheel_speed_mps=held("wheel_speed_mps", 9, 12, 2.0)),
+        stuck("wheel_speed_mps", 9, 12, 2.0),
         "encoder stays at 2.00 m/s without throttle",
         "wheel_speed_mps",
         11.5,
     ),
     "encoder_stuck_at_rest_alone": (
-        lambda r: without_truth(
-            changed(r, "telemetry", wheel_speed_mps=held("wheel_speed_mps", 9, 12, 2.0))
-        ),
+        stuck("wheel_speed_mps", 9, 12, 2.0, alone=True),
         "encoder stays at 2.00 m/s without throttle",
         "wheel_speed_mps",
         11.5,
     ),
     "encoder_stuck_low": (
-        lambda r: changed(r, "telemetry", wheel_speed_mps=held("wheel_speed_mps", 1.3, 4, 0.56)),
+        stuck("wheel_speed_mps", 1.3, 4, 0.56),
         "under drive, slower than the car: stuck",
         "wheel_speed_mps",
         3.0,
     ),
     "encoder_counts_nothing": (
-        lambda r: changed(r, "telemetry", wheel_speed_mps=held("wheel_speed_mps", 0, 12, 0.0)),
+        stuck("wheel_speed_mps", 0, 12, 0.0),
         "encoder stays at 0.00 m/s under drive",
         "wheel_speed_mps",
         4.0,
     ),
     "encoder_counts_nothing_alone": (
-        lambda r: without_truth(
-            changed(r, "telemetry", wheel_speed_mps=held("wheel_speed_mps", 0, 12, 0.0))
-        ),
+        stuck("wheel_speed_mps", 0, 12, 0.0, alone=True),
         "encoder stays at 0.00 m/s",
         "wheel_speed_mps",
         4.0,
     ),
     "encoder_stuck_alone": (
-        lambda r: without_truth(
-            changed(r, "telemetry", wheel_speed_mps=held("wheel_speed_mps", 0.2, 2.4, 1.0))
-        ),
+        stuck("wheel_speed_mps", 0.2, 2.4, 1.0, alone=True),
         "whatever the throttle: stuck",
         "wheel_speed_mps",
         2.0,
     ),
     "gyroscope_stuck": (
-        lambda r: changed(r, "telemetry", gyro_radps=held("gyro_radps", 2, 9, 0.02)),
+        stuck("gyro_radps", 2, 9, 0.02),
         "gyroscope stays at 0.02 rad/s",
         "gyro_radps",
         4.0,
     ),
     "gyroscope_stuck_alone": (
-        lambda r: without_truth(
-            changed(r, "telemetry", gyro_radps=held("gyro_radps", 2.2, 5, 0.02))
-        ),
+        stuck("gyro_radps", 2.2, 5, 0.02, alone=True),
         "gyroscope stays at 0.02 rad/s",
         "gyro_radps",
         4.0,
     ),
     "dead_man_switch": (
-        lambda r: changed(r, "telemetry", armed=held("armed", 3, 4, 0.0)),
+        stuck("armed", 3, 4, 0.0),
         "dead-man switch is released",
         "",
         3.5,
@@ -294,7 +298,7 @@ FAULTS: dict[str, tuple[Callable[[Run], Run], str, str, float]] = {
         0.02,
     ),
     "sensor_silent": (
-        lambda r: changed(r, "telemetry", gyro_radps=held("gyro_radps", 4, 6, np.nan)),
+        stuck("gyro_radps", 4, 6, np.nan),
         "gyro_radps reports nothing",
         "gyro_radps",
         5.0,
@@ -306,7 +310,7 @@ FAULTS: dict[str, tuple[Callable[[Run], Run], str, str, float]] = {
         5.0,
     ),
     "infinite": (
-        lambda r: changed(r, "telemetry", gyro_radps=held("gyro_radps", 4, 4.01, np.inf)),
+        stuck("gyro_radps", 4, 4.01, np.inf),
         "gyro_radps is infinite",
         "gyro_radps",
         4.0,
@@ -507,11 +511,11 @@ def drift(tmp_path_factory) -> Run:
 
 REAL: dict[str, tuple[Callable[[Run], Run], str]] = {
     "encoder": (
-        lambda r: changed(r, "telemetry", wheel_speed_mps=held("wheel_speed_mps", 8, 21, 0.0)),
+        stuck("wheel_speed_mps", 8, 21, 0.0),
         "encoder stays at 0.00",
     ),
     "gyroscope": (
-        lambda r: changed(r, "telemetry", gyro_radps=held("gyro_radps", 8, 21, 0.01)),
+        stuck("gyro_radps", 8, 21, 0.01),
         "gyroscope stays",
     ),
     "dropout": (lambda r: dropped(r, "truth", 12, 12.3), "truth.csv has no rows"),

@@ -6,14 +6,12 @@ import jax
 import numpy as np
 import pytest
 
+from conftest import step_run
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
-from countersteer.drivers.replay import Replay
 from countersteer.errors import InputError
-from countersteer.evaluation.drive import about_run, drive
 from countersteer.runs.files import Table
-from countersteer.runs.run import Run, read_run
-from countersteer.simulator import Simulator
+from countersteer.runs.run import Run
 from countersteer.tuning.speed import Speed, read_speed
 
 WALL = 'name = "wall"\nwalls_m = [[[3.2, -1.5], [3.2, 1.5]]]\n[start]\nx_m = 0.0\ny_m = 0.0\n'
@@ -30,13 +28,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
     found = []
     for level in LEVELS:
         for seed in range(SEEDS):
-            driver = Replay(times=np.zeros(1), throttle=np.array([level]), steering=np.zeros(1))
-            simulator = Simulator(course, car, driver, seed=seed, start=(0.01 * seed, 0.0, 0.0))
+            start = (0.01 * seed, 0.0, 0.0)
             out = folder / f"{level}-{seed}"
-            out.mkdir()
-            about = about_run(simulator, "replay", "rx7", 1)
-            drive(simulator, out, about, 1, 1.2, lambda *_: None)
-            found.append(read_run(out))
+            found.append(step_run(out, course, car, level, 1.2, 1.2, seed=seed, start=start))
     return found
 
 

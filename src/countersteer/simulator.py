@@ -15,7 +15,7 @@ import dataclasses
 import math
 import os
 import warnings
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -329,20 +329,27 @@ def keep_programs(batches: bool = True, blocks: bool = False) -> None:
     through many cars in blocks of some hundred may say `blocks`: then a whole loop is one function
     whose numbers stay in the core's caches.
     """
-    # Without this, scalars that several results need are computed anew for each of them.
-    fusion = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
-    if batches:
-        # XLA's newer emitters abort the process on some batched programs with it (0.10.2).
-        if blocks:
-            fusion += ",xla_cpu_small_while_loop_byte_threshold=100000000"
-            fusion += " --xla_cpu_prefer_vector_width=512"
-        fusion += " --xla_cpu_use_fusion_emitters=false"
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {fusion}".strip()
+        os.environ["XLA_FLAGS"] = f"{flags} {compiler_flags(batches, blocks)}".strip()
     # A cache that cannot be read or written is no cache, and nothing to trouble anyone with.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     jax.config.update("jax_compilation_cache_dir", str(Path(home) / "countersteer" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def compiler_flags(batches: bool = True, blocks: bool = False, backend: Sequence[str] = ()) -> str:
+    """What XLA is told (`keep_programs`); `backend` holds further options of its backend."""
+    # Without this, scalars that several results need are computed anew for each of them.
+    options = ["xla_cpu_use_multi_output_fusion"]
+    flags = []
+    if batches:
+        # XLA's newer emitters abort the process on some batched programs with it (0.10.2).
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    if blocks:
+        # A loop whose numbers take less bytes is compiled into one function.
+        options.append("xla_cpu_small_while_loop_byte_threshold=100000000")
+        flags.append("--xla_cpu_prefer_vector_width=512")
+    return " ".join([f"--xla_backend_extra_options={','.join([*options, *backend])}", *flags])

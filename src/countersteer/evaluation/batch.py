@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
 from countersteer.car.car import Car
+from countersteer.simulator import compiler_flags
 from countersteer.world import planar
 from countersteer.world.planar import Command
 from countersteer.world.state import State
@@ -30,24 +31,15 @@ AXES = State(MOTION, 1, 1, 0, 0, 0, 0, 0)
 
 def flags(cores: int) -> str:
     """What XLA_FLAGS must be before JAX starts."""
+    # Kernels with many results are vectorised too, whatever it takes to show that their results do
+    # not overlap (options of LLVM).
     backend = (
-        "xla_cpu_use_multi_output_fusion",
-        # A loop whose numbers take less is compiled into one function.
-        "xla_cpu_small_while_loop_byte_threshold=100000000",
-        # Kernels with many results are vectorised too, whatever it takes to show that their
-        # results do not overlap (options of LLVM).
         "-runtime-memory-check-threshold=1000000",
         "-vectorize-memory-check-threshold=1000000",
         "-memory-check-merge-threshold=1000000",
     )
-    return " ".join(
-        (
-            f"--xla_backend_extra_options={','.join(backend)}",
-            "--xla_cpu_use_fusion_emitters=false",
-            "--xla_cpu_prefer_vector_width=512",
-            f"--xla_force_host_platform_device_count={cores}",
-        )
-    )
+    devices = f"--xla_force_host_platform_device_count={cores}"
+    return f"{compiler_flags(blocks=True, backend=backend)} {devices}"
 
 
 def advance(

@@ -24,6 +24,7 @@ from countersteer.errors import InputError
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 from countersteer.tuning.windows import (
+    CHANGES,
     EARLY,
     QUANTITIES,
     SLOWEST,
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HORIZON = 1.0  # s, unless told
-CHANGES = {"vx_mps": 0.3, "vy_mps": 0.3, "yaw_rate_radps": 1.0}  # that make a window transient
 SAMPLE = 0.01  # s between the instants at which states are compared
 
 

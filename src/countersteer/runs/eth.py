@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from countersteer.errors import InputError
-from countersteer.runs.files import COMMANDS, TableWriter, command_rows, write_table
-from countersteer.runs.writer import new_folder
+from countersteer.runs.files import COMMANDS, column_rows, command_rows
+from countersteer.runs.writer import RunWriter, new_folder
 
 FULL_LOCK = 36.0  # degrees of the front wheels that a steering of 1 nominally asks for
 
@@ -40,7 +39,7 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
     The files are `commands.csv` (a row each; throttle as logged, its sign the direction; steering
     times a nominal lock of 36 degrees), `truth.csv` (velocity turned into the body's axes, heading
     unwrapped; rows whose state the next one repeats are left out, false yaw rates are empty),
-    `run.toml`.
+    `run.toml`, `run.mcap`.
 
     Raises `InputError` with one line where the file is not an ETH log or is damaged.
     """
@@ -84,11 +83,13 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
         },
     }
     folder = new_folder(out / log.stem, log.stem)
-    (folder / "run.toml").write_text(tomli_w.dumps(about))
-    writer = TableWriter(folder / "commands.csv", COMMANDS)
-    writer.write(command_rows(time, throttle, np.radians(FULL_LOCK * steering)))
-    writer.close()
-    write_table(folder / "truth.csv", {name: column[~repeated] for name, column in truth.items()})
+    truth = {name: column[~repeated] for name, column in truth.items()}
+    cells = {
+        "commands": command_rows(time, throttle, np.radians(FULL_LOCK * steering)),
+        "truth": column_rows(truth.values()),
+    }
+    with RunWriter(folder, about, {"commands": COMMANDS, "truth": tuple(truth)}) as writer:
+        writer.write(cells)
     return {"run": str(folder), "duration_s": float(time[-1]), **about}
 
 

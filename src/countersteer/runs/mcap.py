@@ -186,7 +186,7 @@ class _Scene:
         context: foxglove.Context,
     ) -> None:
         car = drawn_car(about)
-        truth, telemetry = list(tables["truth"]), list(tables["telemetry"])
+        truth, telemetry = list(tables["truth"]), list(tables.get("telemetry", ()))
         self._pose = [truth.index(name) for name in POSE]
         self._steering = truth.index("steering_rad") if "steering_rad" in truth else None
         self._velocity = [truth.index(name) for name in VELOCITY if name in truth]
@@ -234,7 +234,7 @@ class _Scene:
                     slip, yaw_rate = math.degrees(math.atan2(vy, vx)), math.degrees(yaw_rate)
                     shown = (cells[0], *map(repr, (math.hypot(vx, vy), slip, yaw_rate)))
                     yield from self._motion.messages([shown])
-        for row in tables["telemetry"]:
+        for row in tables.get("telemetry", ()):
             for column, frame, log in self._sonars:
                 if row[column]:
                     yield self._scan(float(row[0]), frame, log, float(row[column]))

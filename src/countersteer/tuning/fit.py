@@ -3,12 +3,13 @@
     minimise  sum over windows, quantities, samples of rho((predicted - measured) / scale)
               + sum over parameters of ((u - u_prior) / width)²
 
-where u is the logarithm of a parameter, or itself for one that may be nothing or less
-and rho the soft L1 loss, so that a window in which the motion was caught at another instant counts
-no more than any. Derivatives are exact, through the simulator (`shooting.predict`); the solver is
+where u is the logarithm of a parameter, or itself for one that may be nothing or less, and rho the
+soft L1 loss, so that a window in which the motion was caught at another instant counts no more than
+any. Derivatives are exact, through the simulator (`shooting.predict`); the solver is
 SciPy's trust-region reflective `least_squares`, which keeps the declared ranges.
 
-The body and what drives it are shared by all logs; tyres are fitted for each surface by itself.
+The body and what drives it are shared by all logs; tyres and rolling drag are fitted for each
+surface by itself.
 """
 
 import math
@@ -29,7 +30,8 @@ from countersteer.errors import InputError
 from countersteer.runs.faults import Fault
 from countersteer.runs.run import Run
 from countersteer.tuning import shooting
-from countersteer.tuning.shooting import QUANTITIES, Shots
+from countersteer.tuning.shooting import Shots
+from countersteer.tuning.windows import QUANTITIES
 
 STEP = 0.002  # s; the step's own error is then a hundredth of a log's
 HORIZON = 1.0  # s
@@ -205,7 +207,7 @@ def take_shots(
                 shots = without(shots, fault.column, touched)
             else:
                 clean &= ~touched
-        parts.append(jax.tree.map(lambda leaf, clean=clean: leaf[clean], shots))
+        parts.append(taken(shots, clean))
         starts.append(start[clean])
         of_run.append(np.full(int(clean.sum()), i))
     if not parts or not sum(len(part.surface) for part in parts):
@@ -239,9 +241,17 @@ def blocks(time: np.ndarray) -> np.ndarray:
 class Problem:
     """Residuals and their derivatives for some free parameters over some windows."""
 
-    def __init__(self, cars: dict[str, Car], shots: Shots, free: Sequence[str]) -> None:
-        """`free` paths are fitted, tyres for each surface that has windows."""
-        self.names = list(cars)
+    def __init__(
+        self,
+        cars: dict[str, Car],
+        shots: Shots,
+        free: Sequence[str],
+        prior: dict[str, Car] | None = None,
+    ) -> None:
+        """`free` paths are fitted, those of the floor for each surface that has windows.
+
+        `cars` say what the others are, and what is expected, unless `prior` says that.
+        """
         self.cars = cars
         surfaces = [int(k) for k in np.unique(shots.surface)]
         self.parameters = [
@@ -257,8 +267,7 @@ class Problem:
         )
         declared = [declaration(p.path) for p in self.parameters]
         self.logarithmic = np.array([p.path not in ABSOLUTE for p in self.parameters])
-        start = [self.table[p.surface or 0, PARAMETERS.index(p.path)] for p in self.parameters]
-        self.prior = self.inside(np.array(start))
+        self.prior = self.inside(values(self, prior or cars))
         lowest = np.array([d.low for d in declared])
         self.high = np.array([d.high for d in declared])
         self.low = self.inside(
@@ -406,30 +415,31 @@ def fit(
     `cars` are by surface, in the order of the shots' `surface`; `run_of` tells the halves of the
     data apart. Parameters that the logs do not determine are named and put back.
     """
-    names = ORDER if what == "all" else (what,)
     total = 0
     current = cars
-    for name in names:
+    for name in ORDER[:-1] if what == "all" else ():
         stage = STAGES[name]
         chosen = stage.chooses(shots)
         if not chosen.any():
             report(f"{name}: no window tells of it")
             continue
-        part = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], shots)
-        problem = Problem(current, part, stage.parameters)
-        if name != names[-1]:
-            # Each stage starts from what the one before found, but keeps to the first prior.
-            problem.prior = Problem(cars, part, stage.parameters).prior
+        problem = Problem(current, taken(shots, chosen), stage.parameters, cars)
         solved = problem.solve(problem.inside(values(problem, current)), PASSES)
         total += solved.nfev
         current = problem.cars_at(solved.x)
         report(f"{name}: {int(chosen.sum())} windows, cost {solved.cost:.4g}")
-    stage = STAGES[names[-1]]
+    stage = STAGES[what]
     chosen = stage.chooses(shots)
     if not chosen.any():
         raise InputError(f"--fit {what}: no window of these runs tells of it")
-    part = jax.tree.map(lambda leaf: leaf[chosen], shots)
+    report(f"{what}: {int(chosen.sum())} windows")
+    part = taken(shots, chosen)
     return believed(cars, current, part, stage.parameters, run_of[chosen], total, report)
+
+
+def taken(shots: Shots, chosen: np.ndarray) -> Shots:
+    """Some of the windows."""
+    return jax.tree.map(lambda leaf: leaf[chosen], shots)
 
 
 def values(problem: Problem, cars: dict[str, Car]) -> np.ndarray:
@@ -529,15 +539,12 @@ def by_halves(
     determined: np.ndarray,
     u: np.ndarray,
 ) -> np.ndarray:
-    """Half the difference between fits to two halves of the data, which are cut along the runs."""
-    order = np.argsort(run_of, kind="stable")
-    rank = np.empty(len(order), int)
-    rank[order] = np.arange(len(order))
-    quarter = rank * 8 // len(order)  # eighths of the data, by turns
+    """Half the difference between fits to two halves of the data: its eighths, by turns."""
+    rank = np.argsort(np.argsort(run_of, kind="stable"))
+    eighth = rank * 8 // len(rank)
     ends = []
     for half in (0, 1):
-        part = jax.tree.map(lambda leaf, half=half: leaf[quarter % 2 == half], shots)
-        problem = Problem(cars, part, free)
+        problem = Problem(cars, taken(shots, eighth % 2 == half), free)
         if len(problem.parameters) != len(u):
             return np.zeros(len(u))
         held = Held(problem, determined)

@@ -16,16 +16,23 @@ from countersteer.car.car import Car, Wheels
 from countersteer.car.parameter import Array, Scalar
 from countersteer.runs.run import Run
 from countersteer.tuning import windows
-from countersteer.tuning.windows import asked, body_at, find_references, read_measured
+from countersteer.tuning.windows import (
+    QUANTITIES,
+    asked,
+    body_at,
+    find_references,
+    quantities_of,
+    radii,
+    read_measured,
+    rolling,
+)
 from countersteer.world import motor, planar, servo
-from countersteer.world.chassis import Vector, dot
+from countersteer.world.chassis import Vector
 from countersteer.world.planar import Command
 from countersteer.world.state import Motion
 
-QUANTITIES = ("vx_mps", "vy_mps", "yaw_rate_radps", "wheel_speed_mps")
 BEFORE = 0.6  # s before a window in which servo and controller settle from an old command
 SAMPLE = 0.05  # s between the instants at which motions are compared
-COUNTED = 2  # samples over which the encoder counts
 
 
 class Shots(NamedTuple):
@@ -132,7 +139,7 @@ def predict(car: Car, shot: Shots, dt: float) -> Array:
 
     def sample(state: planar.State, now: Command) -> tuple[planar.State, tuple[Scalar, ...]]:
         state, _ = jax.lax.scan(tick, state, now)
-        return state, _seen(car, state.motion)
+        return state, quantities_of(car, state.motion)
 
     pieces = jax.tree.map(
         lambda line: line[before : before + samples * every].reshape(samples, every),
@@ -141,29 +148,19 @@ def predict(car: Car, shot: Shots, dt: float) -> Array:
     _, seen = jax.lax.scan(sample, state, pieces)
     vx, vy, yaw_rate, rims = seen
     # An encoder counts over two samples; the one before the window is as the one at its start.
-    line = jnp.concatenate([_seen(car, motion)[3][None], rims, rims[-1:]])
+    line = jnp.concatenate([quantities_of(car, motion)[3][None], rims, rims[-1:]])
     counted = (line[:-2] + 2 * line[1:-1] + line[2:]) / 4
     return jnp.stack([vx, vy, yaw_rate, counted])
 
 
-def _seen(car: Car, motion: Motion) -> tuple[Scalar, ...]:
-    front, rear = car.tires.front.radius, car.tires.rear.radius
-    w = motion.wheels
-    mean = (front * (w.front_left + w.front_right) + rear * (w.rear_left + w.rear_right)) / 4
-    return motion.vx, motion.vy, motion.yaw_rate, mean
-
-
 def _start(car: Car, shot: Shots, angle: Scalar, duty: Scalar) -> Motion:
     """The state at a window's start, as far as it was measured."""
-    steered = planar.Steered(*servo.directions(car.body, car.servo, angle))
-    rolls, _ = planar.contact_directions(car, steered)
-    hubs = [dot(roll, shot.velocity) for roll in rolls]
-    slip = jnp.where(jnp.isnan(shot.wheel_speed), 0.0, shot.wheel_speed - sum(hubs) / 4)
-    rims = [
-        jnp.where(jnp.isnan(rim), hub + slip, rim) for rim, hub in zip(shot.rims, hubs, strict=True)
-    ]
+    rims = rolling(car, shot.velocity, angle, shot.wheel_speed)
     wheels = Wheels(
-        *(rim / tire.radius for rim, tire in zip(rims, planar.tires_by_wheel(car), strict=True))
+        *(
+            jnp.where(jnp.isnan(known), rim, known) / radius
+            for rim, known, radius in zip(rims, shot.rims, radii(car), strict=True)
+        )
     )
     zero = 0.0 * shot.charge
     ax, ay = shot.acceleration

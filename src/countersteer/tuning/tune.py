@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 import tomli_w
 
@@ -17,10 +16,10 @@ from countersteer.runs.faults import Fault, faults, refuse, repaired
 from countersteer.runs.run import Run
 from countersteer.tuning import fit, shooting
 from countersteer.tuning.fit import FLOOR, Fitted, Result
-from countersteer.tuning.shooting import QUANTITIES, Shots
+from countersteer.tuning.shooting import Shots
+from countersteer.tuning.windows import CHANGES, QUANTITIES
 
 EVERY = {"fitted": 0.5, "judged": 0.25}  # s between the starts of windows
-CHANGES = np.array([0.3, 0.3, 1.0])  # of vx, vy, yaw rate, that make a window transient
 
 
 class Logs(NamedTuple):
@@ -34,7 +33,7 @@ class Logs(NamedTuple):
 
     def where(self, chosen: np.ndarray) -> "Logs":
         """Some of the windows."""
-        shots = jax.tree.map(lambda leaf: leaf[chosen], self.shots)
+        shots = fit.taken(self.shots, chosen)
         return self._replace(shots=shots, run=self.run[chosen], start=self.start[chosen])
 
 
@@ -144,9 +143,9 @@ def transient(shots: Shots) -> np.ndarray:
     change = np.abs(shots.measured[:, :3] - start)
     wheels = np.abs(shots.measured[:, 3] - shots.wheel_speed[:, None])
     captured = np.isfinite(shots.measured[:, 0]).any(axis=1)
-    lively = np.nan_to_num(change) > CHANGES[:, None]
+    lively = np.nan_to_num(change) > np.array([*CHANGES.values()])[:, None]
     return np.where(
-        captured, lively.any(axis=(1, 2)), (np.nan_to_num(wheels) > CHANGES[0]).any(axis=1)
+        captured, lively.any(axis=(1, 2)), (np.nan_to_num(wheels) > CHANGES["vx_mps"]).any(axis=1)
     )
 
 
@@ -158,7 +157,7 @@ def judged(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
     whole["persistence"] = found["persistence"]
     whole["transient"] = {"windows": int(lively.sum())}
     if lively.any():
-        some = fit.errors(cars, jax.tree.map(lambda leaf: leaf[lively], shots))
+        some = fit.errors(cars, fit.taken(shots, lively))
         whole["transient"] |= {"errors": some["simulated"], "persistence": some["persistence"]}
     return whole
 

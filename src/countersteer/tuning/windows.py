@@ -16,6 +16,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from countersteer.car.car import Car, Wheels
+from countersteer.car.parameter import Scalar
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 from countersteer.world import motor, planar, servo
@@ -24,6 +25,7 @@ from countersteer.world.planar import Command
 from countersteer.world.state import Motion, State
 
 QUANTITIES = ("vx_mps", "vy_mps", "yaw_rate_radps", "wheel_speed_mps")
+CHANGES = {"vx_mps": 0.3, "vy_mps": 0.3, "yaw_rate_radps": 1.0}  # that make a window transient
 EVERY = 0.25  # s between the starts of windows
 SLOWEST = 0.2  # m/s from which a window starts
 
@@ -306,16 +308,25 @@ def wheels_at(
 ) -> Wheels:
     """Spin of the four wheels at these times (rad/s)."""
     if measured.wheels is not None:
-        rims = [wheel.at(time) for wheel in measured.wheels]
+        rims = tuple(wheel.at(time) for wheel in measured.wheels)
     else:
         reference = find_references(measured).get("wheel_speed_mps")
-        steered = planar.Steered(*servo.directions(car.body, car.servo, steering))
-        rolls, _ = planar.contact_directions(car, steered)
-        rims = [np.asarray(dot(roll, velocity)) for roll in rolls]
-        if reference is not None:
-            slip = reference.undone(time, resting) - np.mean(rims, axis=0)
-            rims = [rim + np.nan_to_num(slip) for rim in rims]
+        nothing = np.full(len(time), math.nan)
+        mean = nothing if reference is None else reference.undone(time, resting)
+        rims = rolling(car, velocity, steering, mean)
     return Wheels(*(rim / radius for rim, radius in zip(rims, radii(car), strict=True)))
+
+
+def rolling(car: Car, velocity: Vector, steering: Scalar, mean: Scalar) -> tuple[Scalar, ...]:
+    """Rim speeds of the four wheels (m/s), of this mean: they differ as their hubs' speeds do.
+
+    Where the mean is NaN, they roll.
+    """
+    steered = planar.Steered(*servo.directions(car.body, car.servo, steering))
+    rolls, _ = planar.contact_directions(car, steered)
+    hubs = [dot(roll, velocity) for roll in rolls]
+    slip = jnp.nan_to_num(mean - sum(hubs) / 4)
+    return tuple(hub + slip for hub in hubs)
 
 
 def asked(commands: Table, ticks: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -383,17 +394,18 @@ def simulate(
         size = next(size for size in SIZES if size >= len(chosen))
         rows = np.minimum(np.arange(begin, begin + size), begin + len(chosen) - 1)
         state = jax.tree.map(lambda leaf, rows=rows: jnp.asarray(leaf[rows]), states)
-        pieces = [np.stack([np.asarray(q) for q in _seen(car, state.motion)])[:, :, None]]
+        pieces = [np.stack([np.asarray(q) for q in quantities_of(car, state.motion)])[:, :, None]]
         for piece in range(0, ticks, PIECE):
             count = np.arange(piece, piece + PIECE, dtype=np.int32)
             throttle, steering = asked(commands, starts[rows][None, :] + count[:, None], dt)
-            state, seen = _advance_all(car, state, count, throttle, steering, dt)
+            state, seen = _advance(car, state, count, throttle, steering, dt)
             pieces.append(np.stack([np.asarray(q).T for q in seen]))
         whole = np.concatenate(pieces, axis=2)
         chunks.append(whole[:, : len(chosen), : ticks + 1])
     return dict(zip(QUANTITIES, np.concatenate(chunks, axis=1), strict=True))
 
 
+@partial(jax.jit, static_argnames="dt")
 def _advance(
     car: Car, states: State, counts: jax.Array, throttle: jax.Array, steering: jax.Array, dt: float
 ) -> tuple[State, tuple[jax.Array, ...]]:
@@ -404,15 +416,12 @@ def _advance(
         count, command = now
         step = jax.vmap(planar.step, in_axes=(None, None, 0, 0, None, None))
         states = step(car, no_walls, states, command, count, dt)
-        return states, _seen(car, states.motion)
+        return states, quantities_of(car, states.motion)
 
     return jax.lax.scan(tick, states, (counts, Command(throttle, steering)))
 
 
-_advance_all = jax.jit(_advance, static_argnames="dt")
-
-
-def _seen(car: Car, motion: Motion) -> tuple[Any, ...]:
+def quantities_of(car: Car, motion: Motion) -> tuple[Scalar, ...]:
     """Pick the four quantities; an encoder between the differentials sees the wheels' mean."""
     rims = [radius * spin for radius, spin in zip(radii(car), motion.wheels, strict=True)]
     return motion.vx, motion.vy, motion.yaw_rate, sum(rims) / 4

@@ -1,12 +1,12 @@
 """One drive as a self-contained HTML page that plays it."""
 
 import html
-import importlib.resources
 import json
-import re
 from typing import Any
 
 import numpy as np
+
+from countersteer.viewing.page import filled
 
 # What the eye can tell apart on the page: more digits would only make it larger.
 _DECIMALS = {
@@ -45,13 +45,7 @@ def report_html(view: dict[str, Any]) -> str:
         # No "<" at all is left, so nothing in the data can end the script element around it.
         "view": data.replace("<", "\\u003c"),
     }
-    template = importlib.resources.files("countersteer.viewing") / "report_template.html"
-    # All fields in one pass: text that looks like a field stays text.
-    return re.sub(
-        r"\{\{(title|view)\}\}",
-        lambda field: fields[field[1]],
-        template.read_text(encoding="utf-8"),
-    )
+    return filled("report_template.html", fields)
 
 
 def _rounded_wheel(wheel: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """What a fit found and how far it can be believed, as one self-contained HTML page."""
 
 import base64
-import importlib.resources
 import io
 import math
 import re
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Declaration, declarations
+from countersteer.viewing.page import filled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,12 +76,7 @@ def write_tuning_page(
         "runs": "".join(_run(run, result["runs"]) for run in series),
         "commands": escape(result["commands"]),
     }
-    template = importlib.resources.files("countersteer.viewing") / "tuning_page_template.html"
-    # All fields in one pass: text that looks like a field stays text.
-    page = re.sub(
-        r"\{\{(\w+)\}\}", lambda field: fields[field[1]], template.read_text(encoding="utf-8")
-    )
-    path.write_text(page, encoding="utf-8")
+    path.write_text(filled("tuning_page_template.html", fields), encoding="utf-8")
 
 
 # -------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from countersteer.world.angle import cosine_sine
 from countersteer.world.state import Motion
 
 FAR = 1e5  # m
-FEW = 16
+FEW = 16  # walls that are compared one by one
 PREFERENCE = 1e-3  # depth that a wall gives up per distance by which it misses the corner
 
 

@@ -1,0 +1,17 @@
+"""Pages that stand alone: templates, the style that they share, and what is filled in."""
+
+import importlib.resources
+import re
+from collections.abc import Mapping
+
+FOLDER = importlib.resources.files("countersteer.viewing")
+
+
+def filled(template: str, fields: Mapping[str, str]) -> str:
+    """The template with each `{{field}}` replaced, and the common style for `{{style}}`.
+
+    All in one pass: text that looks like a field stays text.
+    """
+    known = {"style": (FOLDER / "page.css").read_text(encoding="utf-8").rstrip(), **fields}
+    text = (FOLDER / template).read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda field: known[field[1]], text)
