@@ -48,6 +48,16 @@ def number(low: float, high: float, kind: type = float) -> Callable[[str], Any]:
     return read
 
 
+def speeds(text: str) -> tuple[float, float]:
+    """A range of speeds LO:HI, or one."""
+    low, _, high = text.partition(":")
+    read = number(0.2, 20)
+    ends = (read(low), read(high or low))
+    if ends[0] > ends[1]:
+        raise argparse.ArgumentTypeError(f"must rise, not {text}")
+    return ends
+
+
 def parser() -> Parser:
     """All verbs with their options."""
     top = Parser(prog="countersteer", description="Makes a radio-controlled car drift by itself.")
@@ -81,6 +91,28 @@ def parser() -> Parser:
         )
         made.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
 
+    def laps_and_link(made: Parser) -> None:
+        made.add_argument(
+            "--laps",
+            type=number(1, 1000, int),
+            default=1,
+            metavar="N",
+            help="of a closed course (default 1)",
+        )
+        made.add_argument(
+            "--link",
+            choices=("onboard", "radio"),
+            default="onboard",
+            help="where the driver runs: in the car, or behind a radio that delays and loses "
+            "packets (default onboard)",
+        )
+        made.add_argument(
+            "--estimate",
+            choices=("filter", "truth"),
+            default="filter",
+            help="what the driver knows of its motion (default filter: from the sensors)",
+        )
+
     drive = verb("drive", "one closed-loop drive over a course", run_drive)
     drive.add_argument(
         "course",
@@ -95,35 +127,50 @@ def parser() -> Parser:
     )
     physics(drive, "rx7")
     drive.add_argument(
-        "--laps",
-        type=number(1, 1000, int),
-        default=1,
-        metavar="N",
-        help="of a closed course (default 1)",
-    )
-    drive.add_argument(
         "--speed-mps",
-        type=number(0.2, 20),
+        type=speeds,
         default=None,
         metavar="V",
-        help="speed that the driver is asked to bring to a turn (default the driver's)",
+        help="speed that the driver is asked to bring to a turn (default the driver's); with "
+        "--cars also LO:HI",
+    )
+    drive.add_argument(
+        "--cars",
+        metavar="SET",
+        help="drive the car, charge and start that --seed draws from this set, as evaluate does",
     )
     drive.add_argument(
         "--battery", type=number(0, 1), default=1.0, metavar="F", help="charge, 0 to 1 (default 1)"
     )
-    drive.add_argument(
-        "--link",
-        choices=("onboard", "radio"),
-        default="onboard",
-        help="where the driver runs: in the car, or behind a radio that delays and loses packets "
-        "(default onboard)",
+    laps_and_link(drive)
+
+    evaluate = verb("evaluate", "drivers judged over randomised cars", run_evaluate)
+    evaluate.add_argument("course", metavar="COURSE", help="as for drive")
+    evaluate.add_argument(
+        "--driver",
+        nargs="+",
+        default=["drift-turn"],
+        metavar="D",
+        help="as for drive, one or more (default drift-turn)",
     )
-    drive.add_argument(
-        "--estimate",
-        choices=("filter", "truth"),
-        default="filter",
-        help="what the driver knows of its motion (default filter: from the sensors)",
+    evaluate.add_argument(
+        "--trials", type=number(1, 10**6, int), default=1000, metavar="N", help="default 1000"
     )
+    physics(evaluate, "rx7")
+    evaluate.add_argument(
+        "--cars",
+        default="around",
+        metavar="SET",
+        help="what varies: library name or .toml file (default around)",
+    )
+    evaluate.add_argument(
+        "--speed-mps",
+        type=speeds,
+        default=None,
+        metavar="LO:HI",
+        help="speed that the driver is asked to bring to a turn, drawn for each trial, or one V",
+    )
+    laps_and_link(evaluate)
 
     replay = verb("replay", "commands in, motion out; or a log against the simulator", run_replay)
     replay.add_argument(
@@ -289,11 +336,15 @@ def run_drive(options: argparse.Namespace) -> int:
     from countersteer.simulator import Simulator
 
     course, car = load_course(options.course), load_car(options.car, options.set)
-    if options.laps > 1 and not course.closed:
-        raise InputError(f"--laps {options.laps}: {options.course} is open, and driven once")
-    driver = make_driver(
-        options.driver, course, load_car(options.car), options.speed_mps, options.laps
-    )
+    check_laps(options, course)
+    charge, start, speed = options.battery, None, None
+    if options.cars is not None:
+        car, charge, start, speed = drawn_alone(options, course, car)
+    elif options.speed_mps is not None:
+        speed, most = options.speed_mps
+        if most != speed:
+            raise InputError("--speed-mps LO:HI: a range is drawn from with --cars only")
+    driver = make_driver(options.driver, course, load_car(options.car), speed, options.laps)
     name = Path(options.driver).stem if options.driver.endswith(".csv") else options.driver
     simulator = Simulator(
         course,
@@ -303,11 +354,83 @@ def run_drive(options: argparse.Namespace) -> int:
         options.estimate,
         options.dt,
         options.seed,
-        options.battery,
+        charge,
+        start=start,
     )
     # A lap at a crawl still ends.
     longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
     return record(options, simulator, name, course.name, longest, options.laps)
+
+
+def check_laps(options: argparse.Namespace, course: "Course") -> None:
+    """Only a closed course has laps."""
+    if options.laps > 1 and not course.closed:
+        raise InputError(f"--laps {options.laps}: {options.course} is open, and driven once")
+
+
+def drawn_alone(options: argparse.Namespace, course: "Course", car: "Car") -> tuple[Any, ...]:
+    """The trial of `--seed`: car, charge, start and speed asked for."""
+    import jax
+    import numpy as np
+
+    from countersteer.evaluation.population import draw, load_population
+
+    drawn = draw(
+        load_population(options.cars), car, course, [options.seed], np.float32, options.speed_mps
+    )
+    speed = None if drawn.speed is None else float(drawn.speed[0])
+    x, y, heading = (float(value) for value in drawn.pose[0])
+    alone = jax.tree.map(lambda leaf: leaf[0], drawn.cars)
+    return alone, float(drawn.charge[0]), (x, y, heading), speed
+
+
+def run_evaluate(options: argparse.Namespace) -> int:
+    """`evaluate`."""
+    from countersteer.car.files import load_car
+    from countersteer.course.files import load_course
+    from countersteer.evaluation import evaluate
+    from countersteer.evaluation.population import load_population
+    from countersteer.link.link import LINKS
+    from countersteer.runs.writer import new_folder
+    from countersteer.simulator import keep_programs
+
+    keep_programs(blocks=True, cores=os.cpu_count() or 1)
+    course, car = load_course(options.course), load_car(options.car, options.set)
+    check_laps(options, course)
+    if course.goal_distance is None:
+        raise InputError(f"{options.course}: has no goal, so nothing tells a success")
+    nominal, population = load_car(options.car), load_population(options.cars)
+    seeds = range(options.seed, options.seed + options.trials)
+    trials = evaluate.Trials(
+        course, car, population, seeds, options.speed_mps, options.laps,
+        LINKS[options.link], options.estimate, options.dt,
+    )  # fmt: skip
+    scores = {}
+    with Progress(options.json) as progress:
+        for i, name in enumerate(options.driver):
+
+            def made(speed: float | None, name: str = name) -> Any:
+                return make_driver(name, course, nominal, speed, options.laps)
+
+            def report(done: int, trials: int, before: int = i * options.trials) -> None:
+                progress.show(before + done, len(options.driver) * trials)
+
+            scores[name] = trials.run(made, report)
+    found = {name: evaluate.results(score, seeds) for name, score in scores.items()}
+    folder = new_folder(options.out, f"{Path(options.course).stem}-evaluate")
+    result = trials.about() | {"car": options.car, "drivers": found}
+    (folder / "evaluate.json").write_text(json.dumps(result, indent=1) + "\n")
+    picture = folder / "evaluate.png"
+    evaluate.picture(scores, f"{course.name}, {options.car}, {options.trials} trials", picture)
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+        return DONE
+    for line in evaluate.table_lines(found):
+        print(line)
+    print(f"picture: {picture}")
+    again = f"countersteer drive {options.course} --cars {options.cars}"
+    print(f"one trial again: {again} --driver D --seed SEED (and the same other options)")
+    return DONE
 
 
 def run_replay(options: argparse.Namespace) -> int:

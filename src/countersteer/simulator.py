@@ -51,6 +51,7 @@ class Plan(NamedTuple):
     onboard: bool
     truth: bool  # the estimate is the state itself
     sensors: suite.Periods
+    slots: int  # of the delay lines
 
 
 class Surroundings(NamedTuple):
@@ -123,6 +124,7 @@ class Simulator:
             self.link.onboard,
             self.estimate == "truth",
             suite.periods(self.car, self.dt),
+            planar.delay_slots(self.car, self.dt),
         )
 
     def run(self, longest: float) -> Generator[Record, None, None]:
@@ -161,19 +163,9 @@ class Simulator:
         walls = padded(self.course.walls if self.course else np.zeros((0, 4)), dtype)
         key, driver_key = jax.random.split(jax.random.key(self.seed))
         around = Surroundings(walls, sonar.edges(walls), key, dtype.type(self.link.loss))
-        state = planar.initial_state(self.car, self.dt, pose, self.velocity, self.charge)
-        sensors = suite.initial_memory(self.car, state.motion)
-        zero = dtype.type(0)
-        still = Command(zero, zero)
-        up = down = None
-        if not plan.onboard:
-            up = initial_channel(still, plan.control, plan.delay)
-            down = initial_channel(sensors.readings, plan.telemetry, plan.delay)
-        estimate = dead_reckoning.initial_memory(pose, dtype)
-        memory = self.driver.reset(driver_key)
-        if not jax.tree_util.all_leaves([self.driver]):
-            memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
-        return around, Loop(np.int32(0), state, sensors, estimate, still, up, down, memory)
+        return around, begin(
+            plan, self.car, self.driver, pose, self.velocity, self.charge, driver_key
+        )
 
     def _stepped(
         self, plan: Plan, ticks: int, around: Surroundings, loop: Loop
@@ -193,11 +185,46 @@ class Simulator:
         return loop._replace(memory=memory), whole
 
 
+def begin(
+    plan: Plan,
+    car: Car,
+    driver: Driver,
+    pose: tuple[Scalar, Scalar, Scalar],
+    velocity: tuple[Scalar, Scalar, Scalar],
+    charge: Scalar,
+    key: jax.Array,
+) -> Loop:
+    """The loop before its first tick; `key` is the driver's."""
+    dtype = jnp.result_type(car.body.mass)
+    state = planar.initial_state(car, plan.dt, pose, velocity, charge, plan.slots)
+    sensors = suite.initial_memory(car, state.motion)
+    zero = dtype.type(0)
+    still = Command(zero, zero)
+    up = down = None
+    if not plan.onboard:
+        up = initial_channel(still, plan.control, plan.delay)
+        down = initial_channel(sensors.readings, plan.telemetry, plan.delay)
+    estimate = dead_reckoning.initial_memory(pose, dtype)
+    memory = driver.reset(key)
+    if not jax.tree_util.all_leaves([driver]):
+        memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
+    return Loop(np.int32(0), state, sensors, estimate, still, up, down, memory)
+
+
 @partial(jax.jit, static_argnums=(0, 1))
 def scan(
     plan: Plan, ticks: int, car: Car, around: Surroundings, driver: Driver, loop: Loop
 ) -> tuple[Loop, Record]:
     """So many ticks with a driver that JAX can trace."""
+    return jax.lax.scan(
+        lambda carry, _: tick(plan, car, around, driver, carry), loop, None, length=ticks
+    )
+
+
+def tick(
+    plan: Plan, car: Car, around: Surroundings, driver: Driver, loop: Loop
+) -> tuple[Loop, Record]:
+    """One tick with a driver that JAX can trace."""
 
     def act(loop: Loop) -> Loop:
         loop, observation = observe(plan, loop)
@@ -205,14 +232,11 @@ def scan(
         memory = jax.tree.map(_like, memory, loop.memory)
         return loop._replace(command=jax.tree.map(_like, command, loop.command), memory=memory)
 
-    def tick(loop: Loop, _: None) -> tuple[Loop, Record]:
-        if plan.control == 1:
-            loop = act(loop)
-        else:
-            loop = jax.lax.cond(loop.tick % plan.control == 0, act, lambda same: same, loop)
-        return advance(plan, car, around, loop)
-
-    return jax.lax.scan(tick, loop, None, length=ticks)
+    if plan.control == 1:
+        loop = act(loop)
+    else:
+        loop = jax.lax.cond(loop.tick % plan.control == 0, act, lambda same: same, loop)
+    return advance(plan, car, around, loop)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -320,18 +344,18 @@ def _like(new: Any, old: Any) -> Any:
     return jax.tree.map(lambda n, o: jnp.asarray(n, o.dtype), new, old)
 
 
-def keep_programs(batches: bool = True, blocks: bool = False) -> None:
+def keep_programs(batches: bool = True, blocks: bool = False, cores: int = 1) -> None:
     """Settings for the process: compile well, and keep compiled programs in the user's cache.
 
     To be called before JAX computes anything; the command line does. A library does not do this
     behind its user's back. Without it all works, but starts and runs at half the speed or less.
     A process that drives one car at a time may say so, and drives it twice as fast. One that works
     through many cars in blocks of some hundred may say `blocks`: then a whole loop is one function
-    whose numbers stay in the core's caches.
+    whose numbers stay in the core's caches. `cores` is how many devices JAX makes of the CPU.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {compiler_flags(batches, blocks)}".strip()
+        os.environ["XLA_FLAGS"] = f"{flags} {compiler_flags(batches, blocks, cores=cores)}".strip()
     # A cache that cannot be read or written is no cache, and nothing to trouble anyone with.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
@@ -340,7 +364,9 @@ def keep_programs(batches: bool = True, blocks: bool = False) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-def compiler_flags(batches: bool = True, blocks: bool = False, backend: Sequence[str] = ()) -> str:
+def compiler_flags(
+    batches: bool = True, blocks: bool = False, backend: Sequence[str] = (), cores: int = 1
+) -> str:
     """What XLA is told (`keep_programs`); `backend` holds further options of its backend."""
     # Without this, scalars that several results need are computed anew for each of them.
     options = ["xla_cpu_use_multi_output_fusion"]
@@ -352,4 +378,6 @@ def compiler_flags(batches: bool = True, blocks: bool = False, backend: Sequence
         # A loop whose numbers take less bytes is compiled into one function.
         options.append("xla_cpu_small_while_loop_byte_threshold=100000000")
         flags.append("--xla_cpu_prefer_vector_width=512")
+    if cores > 1:
+        flags.append(f"--xla_force_host_platform_device_count={cores}")
     return " ".join([f"--xla_backend_extra_options={','.join([*options, *backend])}", *flags])

@@ -9,15 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Scalar, pytree
+from countersteer.car.parameter import Array, Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers import straighten
 from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.stop_angle import StopAngle, interpolate
 from countersteer.drivers.straighten import Straighten
 from countersteer.errors import InputError
 
-STRAIGHT, SPIN, CATCH = 0, 1, 2
-SPEED = 2.02  # m/s, unless another is asked for
+STRAIGHT, SPIN, STOP, SETTLE = 0, 1, 2, 3
+SPEED = 2.0  # m/s, unless another is asked for
+NEWS = 0.03  # m, standard deviation of what the front sonar says of the corner's distance
+DOUBT = 0.35  # m, standard deviation of that distance as a corridor begins
+SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
+GATE = 3.5  # standard deviations beyond which a reading is a spike
 
 
 class Memory(NamedTuple):
@@ -26,117 +31,210 @@ class Memory(NamedTuple):
     phase: Scalar
     turn: Scalar  # turns begun
     since: Scalar  # when the phase began, s
-    walked: Scalar  # distance along the straight since the last turn, m
-    ahead: Scalar  # filtered distance of the front sonar, m
-    heard: Scalar  # its reading before
+    entry: Scalar  # speed at which the turn was begun, m/s
+    hand: Scalar  # of the turn: 1 left, -1 right
+    calm: Scalar  # s for which the car has gone straight
+    corner: Scalar  # distance along the corridor to the next corner, m
+    doubt: Scalar  # its variance, m²
     straight: straighten.Memory
 
 
 @pytree
-class DriftTurn:
-    """Straightens; turns the wheels over at the wall; turns them back in time to end up straight.
+class Turning:
+    """How a turn is driven: commands over yaw rate and heading.
 
-    The turn begins when the wall ahead is near: wheels over, throttle high. When the heading turned
-    plus what it will still turn reaches the target: wheels back, throttle off. What it will still
-    turn is `coast` times the yaw rate: the paper's regression, with a slope set by hand. Targets
-    are headings of corridors, so a turn's error is the next one's to mend. The lock shrinks as the
-    speed squared grows, and holds the yaw rate, so that the car is not thrown round.
+    Tables hold a number for each of the `speeds` of entry; between them they are interpolated.
+    """
+
+    speeds: Array  # m/s
+    lead: Array  # distance to the corner at which a turn by 90° is begun, m
+    lock: Array  # rad
+    rate: Array  # yaw rate that the spin is held at by the lock, rad/s
+    throttle: Array
+    counter: Array  # lock while stopping, rad
+    rate_gain: Scalar  # lock per yaw rate that is missing, s
+    stop_gain: Scalar  # lock given back per angle that would be missing, rad/rad
+    settled: Scalar  # yaw rate (rad/s) under which the heading is held
+    hold_p: Scalar  # lock per heading error while it settles, rad/rad
+    hold_d: Scalar  # lock per yaw rate, s
+    hold_slip: Scalar  # part of the front wheels' sideslip that they follow
+    hold_throttle: Scalar  # throttle while it settles
+
+    def spin(self, entry: Scalar, rate: Scalar) -> Command:
+        """Wheels over, throttle high: for a left turn. `rate` is the yaw rate."""
+        lock = interpolate(self.speeds, self.lock, entry)
+        held = interpolate(self.speeds, self.rate, entry)
+        throttle = interpolate(self.speeds, self.throttle, entry)
+        return Command(throttle, lock + self.rate_gain * (held - rate))
+
+    def stop(self, entry: Scalar, missing: Scalar) -> Command:
+        """Wheels back, throttle none: for a left turn of which so much angle would be missing."""
+        counter = interpolate(self.speeds, self.counter, entry)
+        return Command(0.0 * counter, self.stop_gain * missing - counter)
+
+
+@pytree
+class DriftTurn:
+    """Straightens; turns the wheels over before the corner; turns them back in time.
+
+    When the wheels turn over is told by the distance to the corner, which the front sonar and the
+    encoder tell. At each tick of the turn the driver asks how far the car would still turn if it
+    were stopped now (`stop_angle`), and stops when that is what is left of the target. Targets are
+    headings of corridors, so a turn's error is the next one's to mend (`carry`); without that they
+    are counted from the heading at which the turn was begun.
     """
 
     straight: Straighten
+    turning: Turning
+    stop_angle: StopAngle
     angles: np.ndarray  # of the turns in their order, rad; 0 behind the last
     gaps: np.ndarray  # distance along the centre line to each turn from the one before, m
     front_x: Scalar  # mount of the front sonar, m
+    front_axle: Scalar
     width: Scalar
-    ping: Scalar  # s between two readings of a sonar
+    cone: Scalar  # half-angle of the front sonar's cone, rad
     front: int = dataclasses.field(metadata={"static": True})
-    trigger: Scalar = 1.46  # distance of the centre of mass to the wall ahead at handover, m
-    trigger_speed: Scalar = 0.455  # more of it per speed over 2 m/s, s
-    lock: Scalar = 0.37  # rad
-    lock_speed: Scalar = 2.0  # m/s from which the lock shrinks
-    rate: Scalar = 3.37  # yaw rate that the spin is held at by the lock, rad/s
-    rate_gain: Scalar = 0.24  # s
-    throttle: Scalar = 0.63
-    coast: Scalar = 0.12  # s
-    counter: Scalar = 0.468  # lock while catching, rad
-    settled: Scalar = 1.2  # yaw rate (rad/s) at which the straightening takes over
+    carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
+    linked: Scalar = 0.0  # 1: a turn begins as soon as the one before has ended
     longest: Scalar = 1.2  # s that a phase of a turn may take
 
     def reset(self, key: jax.Array) -> Memory:
-        """Straight ahead."""
-        return Memory(STRAIGHT, 0, 0.0, 0.0, math.inf, math.inf, self.straight.reset(key))
+        """Straight ahead, a corridor's length away from the first corner."""
+        gap = jnp.asarray(self.gaps)[0]
+        return Memory(
+            STRAIGHT, 0, 0.0, 0.0, 1.0, 0.0, gap, DOUBT**2 + 0.0 * gap, self.straight.reset(key)
+        )
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
-        seen, now = observation, observation.time
+        seen, now, own = observation, observation.time, self.turning
         dt = now - memory.straight.time
         straight = self.straight.follow(memory.straight, seen)
         estimate = seen.estimate
         angle = jnp.asarray(self.angles)[memory.turn]
-        gap = jnp.asarray(self.gaps)[memory.turn]
-        hand = jnp.sign(angle)
-
-        # A spike is a reading shorter than the one before it allows; taking the longer of the two,
-        # the earlier one less what was driven since, costs no delay.
-        heard = seen.sonar[self.front]
-        fresh = heard.age <= dt + 1e-9
-        expected = memory.heard - estimate.vx * self.ping
-        ahead = jnp.where(
-            fresh, jnp.maximum(heard.value, expected), memory.ahead - dt * estimate.vx
-        )
-        before = jnp.where(fresh, heard.value, memory.heard)
-        walked = memory.walked + dt * estimate.vx
+        gap = jnp.asarray(self.gaps)[memory.turn + 1]
+        corner, doubt = self._approach(memory, seen, straight.bearing, angle, dt)
 
         speed = jnp.maximum(estimate.vx, 0.5)
-        handover = self.trigger + self.trigger_speed * (speed - 2.0) - self.front_x
+        lead = interpolate(own.speeds, own.lead, speed) * jnp.tan(
+            jnp.minimum(jnp.abs(angle), 2.1) / 2
+        )
         lined_up = jnp.abs(estimate.heading - straight.bearing) < 0.5
-        near = (ahead < handover) & (walked > gap - 0.75 * self.width) & lined_up
+        near = ((corner < lead) & lined_up) | (self.linked > 0)
         begins = (memory.phase == STRAIGHT) & near & (angle != 0)
-        bearing = jnp.where(begins, straight.bearing + angle, straight.bearing)
+        from_here = straight.bearing + (1 - self.carry) * (estimate.heading - straight.bearing)
+        bearing = jnp.where(begins, from_here + angle, straight.bearing)
+        hand = jnp.where(begins, jnp.sign(angle), memory.hand)
+        entry = jnp.where(begins, speed, memory.entry)
 
-        # While turning, `turn` is already the next one; its hand is that of the way to the bearing.
-        left_over = bearing - estimate.heading
-        turning = jnp.sign(left_over)
-        still = self.coast * jnp.abs(estimate.yaw_rate)
+        left_over = hand * (bearing - estimate.heading)
+        rate = hand * estimate.yaw_rate
+        missing = left_over - self.stop_angle.angle(speed, jnp.maximum(rate, 0.0))
         late = now - memory.since > self.longest
-        stops = (memory.phase == SPIN) & ((jnp.abs(left_over) <= still) | late)
-        ends = (memory.phase == CATCH) & ((jnp.abs(estimate.yaw_rate) < self.settled) | late)
-        phase = jnp.where(
-            begins, SPIN, jnp.where(stops, CATCH, jnp.where(ends, STRAIGHT, memory.phase))
-        )
-        changed = begins | stops | ends
+        stops = (memory.phase == SPIN) & ((missing <= 0) | late)
+        settles = (memory.phase == STOP) & ((rate < own.settled) | late)
+        straight_on = (jnp.abs(estimate.yaw_rate) < 0.5) & (jnp.abs(estimate.vy) < 0.17 * speed)
+        calm = jnp.where(straight_on, memory.calm + dt, 0.0)
+        ends = (memory.phase == SETTLE) & ((calm > 0.06) | late)
+        phase = memory.phase
+        for happens, into in ((begins, SPIN), (stops, STOP), (settles, SETTLE), (ends, STRAIGHT)):
+            phase = jnp.where(happens, into, phase)
+        changed = begins | stops | settles | ends
 
-        spin_hand = jnp.where(begins, hand, turning)
-        lock = self.lock * jnp.minimum(1.0, (self.lock_speed / speed) ** 2)
-        lock = lock + self.rate_gain * (self.rate - spin_hand * estimate.yaw_rate)
-        lock = jnp.clip(lock, -self.straight.limit, self.straight.limit)
-        over = Command(self.throttle + 0.0 * lock, spin_hand * lock)
-        back = Command(0.0 * lock, -jnp.sign(estimate.yaw_rate) * self.counter)
-        ahead_command = self.straight.command(straight, seen, self.straight.speed)
-        command = Command(
-            *(
-                jnp.where(phase == SPIN, o, jnp.where(phase == CATCH, b, s))
-                for o, b, s in zip(over, back, ahead_command, strict=True)
-            )
+        slip = jnp.arctan2(estimate.vy + self.front_axle * estimate.yaw_rate, speed)
+        hold = (
+            own.hold_p * (bearing - estimate.heading)
+            - own.hold_d * estimate.yaw_rate
+            + own.hold_slip * slip
         )
+        spin, stop = own.spin(entry, rate), own.stop(entry, missing)
+        on = self.straight.command(straight, seen, self.straight.speed)
+        steering, throttle = on.steering, on.throttle
+        for which, lock, power in (
+            (SPIN, hand * spin.steering, spin.throttle),
+            (STOP, hand * stop.steering, stop.throttle),
+            (SETTLE, hold, own.hold_throttle),
+        ):
+            steering = jnp.where(phase == which, lock, steering)
+            throttle = jnp.where(phase == which, power, throttle)
+        limit = self.straight.limit
+        command = Command(jnp.clip(throttle, -1.0, 1.0), jnp.clip(steering, -limit, limit))
         straight = straight._replace(
             bearing=bearing,
             # A new corridor: nothing is known of the offset but what the sonars will tell.
-            offset=jnp.where(phase == STRAIGHT, straight.offset, 0.0),
+            offset=jnp.where((phase == SPIN) | (phase == STOP), 0.0, straight.offset),
             integral=jnp.where(phase == STRAIGHT, straight.integral, 0.0),
         )
         return command, Memory(
             phase,
             memory.turn + begins,
             jnp.where(changed, now, memory.since),
-            jnp.where(begins, 0.0, walked),
-            ahead,
-            before,
+            entry,
+            hand,
+            calm,
+            jnp.where(begins, gap + corner * jnp.cos(angle), corner),
+            jnp.where(begins, DOUBT**2, doubt),
             straight,
         )
 
+    def _approach(
+        self, memory: Memory, seen: Observation, bearing: Scalar, angle: Scalar, dt: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        """Distance to the next corner and its variance: odometry, and the wall ahead.
 
-def drift_turn(course: Course, car: Car, speed: float | None = None, laps: int = 1) -> DriftTurn:
+        The wall behind a corner by an angle a stands w/2 beyond it, its normal turned by 90° - a
+        from the heading: from a distance c before the corner it is c sin a + w/2 away, and an
+        echo comes from within the cone, so from as much farther as the cone is short of the normal.
+        A reading that cannot be is a spike, short or long; so is one that stands still while the
+        car moves. None costs any delay: one that can be is believed at once.
+        """
+        error = seen.estimate.heading - bearing
+        along = seen.estimate.vx * jnp.cos(error) - seen.estimate.vy * jnp.sin(error)
+        corner = memory.corner - dt * along
+        doubt = memory.doubt + dt * SLIPPING**2
+        heard = seen.sonar[self.front]
+        sine = jnp.maximum(jnp.sin(jnp.abs(angle)), 0.5)
+        normal = jnp.maximum(jnp.abs(math.pi / 2 - jnp.abs(angle)) - self.cone, 0.0)
+        range_ = heard.value * jnp.cos(normal)
+        told = (range_ - self.width / 2) / sine + self.front_x
+        news = told - corner
+        likely = news**2 < GATE**2 * (doubt + NEWS**2)
+        fresh = (heard.age <= dt + 1e-9) & (jnp.abs(error) < 0.3) & (memory.phase == STRAIGHT)
+        gain = jnp.where(fresh & likely, doubt / (doubt + NEWS**2), 0.0)
+        return corner + jnp.where(gain > 0, gain * news, 0.0), (1 - gain) * doubt
+
+
+DEFAULT = Turning(
+    speeds=np.array([1.4, 1.9, 2.4]),
+    lead=np.array([0.55, 0.76, 1.0]),
+    lock=np.array([0.4, 0.37, 0.25]),
+    rate=np.array([4.0, 3.4, 3.4]),
+    throttle=np.array([1.0, 0.7, 0.6]),
+    counter=np.array([0.45, 0.45, 0.45]),
+    rate_gain=0.24,
+    stop_gain=0.5,
+    settled=1.2,
+    hold_p=0.9,
+    hold_d=0.1,
+    hold_slip=0.5,
+    hold_throttle=0.15,
+)
+STOPS = StopAngle(
+    speeds=np.array([1.0, 1.6, 2.2]),
+    offset=np.zeros(3),
+    slope=np.full(3, 0.12),
+    deviation=np.full(3, 0.1),
+)
+
+
+def drift_turn(
+    course: Course,
+    car: Car,
+    speed: float | None = None,
+    laps: int = 1,
+    turning: Turning = DEFAULT,
+    stop_angle: StopAngle = STOPS,
+) -> DriftTurn:
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
 
     Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
@@ -152,10 +250,13 @@ def drift_turn(course: Course, car: Car, speed: float | None = None, laps: int =
     front = straighten.mount_number(car, "front")
     return DriftTurn(
         straight=straighten.straighten(course, car, SPEED if speed is None else speed),
+        turning=turning,
+        stop_angle=stop_angle,
         angles=np.array([t.angle for t in turns] + [0.0]),
-        gaps=np.append(np.diff(marks), np.inf),
+        gaps=np.append(np.diff(marks), [1e3, 1e3]),
         front_x=sonar.mounts[front].x,
+        front_axle=car.body.front_axle,
         width=course.width or 1.0,
-        ping=(len(sonar.mounts) if sonar.firing == "in-turn" else 1) / sonar.rate,
+        cone=sonar.half_angle,
         front=front,
     )

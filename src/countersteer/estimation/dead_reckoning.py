@@ -35,7 +35,7 @@ class Memory(NamedTuple):
 
 def initial_memory(pose: tuple[float, float, float], dtype: np.dtype) -> Memory:
     """At rest at a known pose."""
-    estimate = Estimate(*(dtype.type(value) for value in (*pose, 0, 0, 0)))
+    estimate = Estimate(*(jnp.asarray(value, dtype) for value in (*pose, 0, 0, 0)))
     none = np.int32(0)
     return Memory(estimate, none, none, none)
 

@@ -38,8 +38,7 @@ def flags(cores: int) -> str:
         "-vectorize-memory-check-threshold=1000000",
         "-memory-check-merge-threshold=1000000",
     )
-    devices = f"--xla_force_host_platform_device_count={cores}"
-    return f"{compiler_flags(blocks=True, backend=backend)} {devices}"
+    return compiler_flags(blocks=True, backend=backend, cores=cores)
 
 
 def advance(

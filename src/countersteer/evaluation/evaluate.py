@@ -1,0 +1,161 @@
+"""Drivers judged over randomised cars: success, errors and times with their intervals."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.stats import binomtest
+
+from countersteer.car.car import Car
+from countersteer.course.course import Course
+from countersteer.drivers.driver import Driver
+from countersteer.evaluation.population import Population, draw
+from countersteer.evaluation.rollout import REACHED, STATUS, Score, rollouts
+from countersteer.link.link import Link
+from countersteer.simulator import Simulator
+
+DRIFT = math.radians(25)  # sideslip that makes a turn a drift
+CONFIDENCE = 0.95
+
+
+SLOWEST = 0.5  # m/s: a trial that takes longer is out of time
+
+
+@dataclasses.dataclass(frozen=True)
+class Trials:
+    """What all drivers of an evaluation have in common."""
+
+    course: Course
+    car: Car  # the nominal one
+    population: Population
+    seeds: Sequence[int]
+    speeds: tuple[float, float] | None  # asked for; None: the driver's own
+    laps: int
+    link: Link
+    estimate: str
+    dt: float
+
+    def run(
+        self,
+        make: Callable[[float | None], Driver],
+        report: Callable[[int, int], None] = lambda *_: None,
+    ) -> Score:
+        """All trials of one driver, in 32 bits; `make` makes it for a speed."""
+        drawn = draw(self.population, self.car, self.course, self.seeds, np.float32, self.speeds)
+        if drawn.speed is None:
+            drivers = [make(None)] * len(self.seeds)
+        else:
+            made = {speed: make(speed) for speed in set(drawn.speed.tolist())}
+            drivers = [made[speed] for speed in drawn.speed.tolist()]
+        car = jax.tree.map(np.float32, self.car)
+        simulator = Simulator(self.course, car, drivers[0], self.link, self.estimate, self.dt)
+        longest = 3.0 + (self.course.lap_end(self.laps) or 0.0) / SLOWEST
+        return rollouts(simulator, drawn, drivers, self.seeds, self.laps, longest, report)
+
+    def about(self) -> dict[str, Any]:
+        """What a record says of the trials."""
+        return {
+            "course": self.course.name,
+            "cars": self.population.name,
+            "first_seed": int(self.seeds[0]),
+            "speed_mps": None if self.speeds is None else list(self.speeds),
+            "laps": self.laps,
+            "link": self.link.name,
+            "estimate": self.estimate,
+            "dt_s": self.dt,
+        }
+
+
+def interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's interval of a share."""
+    found = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)
+
+
+def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
+    """What came of a driver's trials; names and units are those of the JSON."""
+    won, turns = score.status == REACHED, score.turns
+    count, trials = int(np.sum(won)), len(seeds)
+    drifts = np.all(turns.peak_sideslip > DRIFT, axis=1)
+    errors = np.degrees(turns.error[won])
+    numbers = np.asarray(seeds)
+
+    def median(values: np.ndarray) -> float | None:
+        return float(np.median(values)) if values.size else None
+
+    return {
+        "trials": trials,
+        "successes": count,
+        "success_rate": count / trials,
+        "success_interval": list(interval(count, trials)),
+        "drift_share": float(np.mean(drifts[won])) if count else None,
+        "heading_error_rms_deg": float(np.sqrt(np.mean(errors**2))) if errors.size else None,
+        "peak_sideslip_deg_median": median(np.degrees(turns.peak_sideslip[won])),
+        "entry_speed_mps_median": median(turns.entry_speed[won]),
+        "lap_time_s_median": median(score.goal_time[won]),
+        "failed_seeds": [int(seed) for seed in numbers[~won]],
+        "failures": {
+            STATUS[code]: [int(seed) for seed in numbers[score.status == code]]
+            for code in np.unique(score.status[~won])
+        },
+    }
+
+
+def table_lines(found: Mapping[str, dict[str, Any]]) -> list[str]:
+    """The results of several drivers as a table for a terminal."""
+    head = f"{'':24}{'success':>20}{'drifts':>8}{'heading':>9}{'sideslip':>10}{'lap':>8}"
+    lines = [head]
+    for name, one in found.items():
+        low, high = one["success_interval"]
+        rate = f"{100 * one['success_rate']:.1f} % ({100 * low:.1f}-{100 * high:.1f})"
+
+        def text(key: str, form: str, factor: float = 1.0, one: dict[str, Any] = one) -> str:
+            return "-" if one[key] is None else format(factor * one[key], form)
+
+        lines.append(
+            f"{name:24}{rate:>20}{text('drift_share', '.1f', 100):>7}%"
+            f"{text('heading_error_rms_deg', '.2f'):>8}°"
+            f"{text('peak_sideslip_deg_median', '.1f'):>9}°{text('lap_time_s_median', '.2f'):>7}s"
+        )
+        for reason, seeds in one["failures"].items():
+            shown = " ".join(map(str, seeds[:12])) + (" …" if len(seeds) > 12 else "")
+            lines.append(f"  {len(seeds)} {reason}: seeds {shown}")
+    return lines
+
+
+def picture(scores: Mapping[str, Score], title: str, path: Path) -> None:
+    """A picture: heading errors and peak sideslip of all turns, and lap times, by driver."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (errors, slips, laps) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
+    for name, score in scores.items():
+        won, turns = score.status == REACHED, score.turns
+        if not np.any(won):
+            continue
+        for axes, values in (
+            (errors, np.degrees(turns.error[won]).ravel()),
+            (slips, np.degrees(turns.peak_sideslip[won]).ravel()),
+            (laps, score.goal_time[won]),
+        ):
+            axes.hist(values, bins=40, histtype="step", linewidth=1.5, label=name)
+    slips.axvline(math.degrees(DRIFT), color="grey", linewidth=0.8)
+    for axes, name in (
+        (errors, "heading error at a turn's end, °"),
+        (slips, "peak sideslip of a turn, °"),
+        (laps, "time to the goal, s"),
+    ):
+        axes.set_xlabel(name)
+    errors.set_ylabel("turns of successes")
+    laps.set_ylabel("successes")
+    if errors.get_legend_handles_labels()[0]:
+        errors.legend(frameon=False, fontsize=8)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

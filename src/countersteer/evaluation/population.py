@@ -1,0 +1,178 @@
+"""Cars drawn around a nominal one: a set is a file, and a trial is its seed."""
+
+import dataclasses
+import importlib.resources
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.car.files import read_toml
+from countersteer.car.parameter import Array, Declaration, changed, declarations, unknown_key
+from countersteer.course.course import Course
+from countersteer.errors import InputError
+
+LIBRARY = importlib.resources.files("countersteer.evaluation") / "library"
+KINDS = ("within", "plus", "low", "high")
+START = {"along_m": 1.0, "offset_m": 1.0, "heading_deg": math.pi / 180}  # factors to SI
+
+
+class Varied(NamedTuple):
+    """Parameters that one draw u in [-1, 1] sets, in the units used inside.
+
+    value · (1 + within u) + plus u, or from one of `ends` to the other.
+    """
+
+    paths: tuple[str, ...]  # of names inside
+    declared: tuple[Declaration, ...]
+    within: float
+    plus: float
+    ends: tuple[float, float] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Population:
+    """What trials draw from. SI units and radians."""
+
+    name: str
+    varied: tuple[Varied, ...]
+    charge: tuple[float, float]
+    start: tuple[float, float, float]  # most along the line, to its left, and turned
+    floor: tuple[float, float]  # deviation of the friction, relative, and its length (m)
+
+
+class Drawn(NamedTuple):
+    """A batch of trials; the leaves of `cars` have an axis in front."""
+
+    cars: Car
+    charge: Array
+    pose: Array  # (n, 3) x, y, heading
+    speed: Array | None  # that the driver is asked to bring to a turn
+
+
+def load_population(name: str) -> Population:
+    """A set from the library or a file. Raises `InputError` naming file and key."""
+    tables, where = read_toml(name, LIBRARY, "set of cars")
+    for key in tables:
+        if key not in ("description", "vary", "start", "floor"):
+            raise unknown_key(where, key, {"vary": 0, "start": 0, "floor": 0})
+    varied = tuple(_varied(where, key, entry) for key, entry in tables.get("vary", {}).items())
+    start, floor = tables.get("start", {}), tables.get("floor", {})
+    for table, known in (
+        (start, ("charge", *START)),
+        (floor, ("friction", "length_m")),
+    ):
+        for key in table:
+            if key not in known:
+                raise unknown_key(where, key, dict.fromkeys(known, 0))
+    charge = start.get("charge", [1.0, 1.0])
+    if not (isinstance(charge, list) and len(charge) == 2):
+        raise InputError(f"{where}: start.charge must be [low, high] within [0, 1]")
+    low, high = (_number(where, "start.charge", value, 0, 1) for value in charge)
+    if low > high:
+        raise InputError(f"{where}: start.charge must be [low, high] within [0, 1]")
+    most = (
+        factor * _number(where, f"start.{key}", start.get(key, 0.0), 0, 360)
+        for key, factor in START.items()
+    )
+    deviation = _number(where, "floor.friction", floor.get("friction", 0.0), 0, 0.5)
+    length = _number(where, "floor.length_m", floor.get("length_m", 0.5), 0.01, 100)
+    along, offset, heading = most
+    return Population(name, varied, (low, high), (along, offset, heading), (deviation, length))
+
+
+def _number(where: str, key: str, value: Any, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise InputError(f"{where}: {key} must be a number in [{low:g}, {high:g}], not {value!r}")
+    return float(value)
+
+
+def _varied(where: str, key: str, entry: Any) -> Varied:
+    """One line of `[vary]`."""
+    paths, declared, factors = [], [], []
+    for path in key.split(","):
+        inside, found, factor = locate(where, path.strip())
+        paths.append(inside)
+        declared.append(found)
+        factors.append(factor)
+    if not isinstance(entry, dict) or not entry or set(entry) - set(KINDS):
+        raise InputError(f"{where}: {key} must be a table of {', '.join(KINDS)}")
+    if len({"low", "high"} & set(entry)) == 1 or ("low" in entry and len(entry) > 2):
+        raise InputError(f"{where}: {key} needs low and high together, and nothing beside them")
+    factor = factors[0]
+    ends = None
+    if "low" in entry:
+        bounds = (declared[0].low / factor, declared[0].high / factor)
+        low, high = (_number(where, f"{key}.{end}", entry[end], *bounds) for end in ("low", "high"))
+        ends = (factor * low, factor * high)
+    within = _number(where, f"{key}.within", entry.get("within", 0.0), 0, 1)
+    plus = factor * _number(where, f"{key}.plus", entry.get("plus", 0.0), 0, 1e6)
+    return Varied(tuple(paths), tuple(declared), within, plus, ends)
+
+
+def locate(where: str, path: str) -> tuple[str, Declaration, float]:
+    """Of a parameter named as files do: its dotted path inside, declaration, and unit's factor."""
+    from countersteer.car.parameter import EDGE
+
+    part: Any = Car()
+    *rooms, key = path.split(".")
+    for room in rooms:
+        part = getattr(part, room, None)
+        if not dataclasses.is_dataclass(part):
+            raise InputError(f"{where}: unknown parameter {path} ('list parameters' has them all)")
+    known = declarations(type(part))
+    if key not in known or known[key][1].choices:
+        raise InputError(f"{where}: unknown parameter {path} ('list parameters' has them all)")
+    name, declared = known[key]
+    return ".".join([*rooms, name]), declared, EDGE[declared.unit][1]
+
+
+def draw(
+    population: Population,
+    car: Car,
+    course: Course | None,
+    seeds: Sequence[int],
+    dtype: Any,
+    speeds: tuple[float, float] | None = None,
+) -> Drawn:
+    """One car, charge, start and speed to ask for, for each seed, around a nominal car."""
+    count = len(population.varied) + 5
+    even = np.array([np.random.default_rng(seed).uniform(-1, 1, count) for seed in seeds])
+    for number, entry in enumerate(population.varied):
+        for path, declared in zip(entry.paths, entry.declared, strict=True):
+            u = even[:, number]
+            if entry.ends is not None:
+                value = _between(entry.ends, u)
+            else:
+                nominal = _value(car, path)
+                value = nominal * (1 + entry.within * u) + entry.plus * u
+            car = changed(car, path, np.clip(value, declared.low, declared.high))
+    n = len(seeds)
+    cars = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf, dtype), (n,)), car)
+    charge = _between(population.charge, even[:, -4])
+    speed = None if speeds is None else _between(speeds, even[:, -5])
+    pose = np.zeros((n, 3))
+    if course is not None:
+        along, offset, turned = (
+            m * even[:, i] for m, i in zip(population.start, (-3, -2, -1), strict=True)
+        )
+        x, y, heading = course.start
+        pose[:, 0] = x + along * math.cos(heading) - offset * math.sin(heading)
+        pose[:, 1] = y + along * math.sin(heading) + offset * math.cos(heading)
+        pose[:, 2] = heading + turned
+    return Drawn(cars, charge.astype(dtype), pose.astype(dtype), speed)
+
+
+def _between(ends: tuple[float, float], even: Array) -> Array:
+    """From one end to the other as `even` goes from -1 to 1."""
+    return ends[0] + (ends[1] - ends[0]) * (even + 1) / 2
+
+
+def _value(car: Car, path: str) -> float:
+    value: Any = car
+    for name in path.split("."):
+        value = getattr(value, name)
+    return float(value)

@@ -1,0 +1,316 @@
+"""Many closed-loop drives at once, judged as they go.
+
+Each lane is a trial: its own car, start, noise and driver's numbers. Trials run in blocks, a block
+on each core, in pieces of car time; between pieces those that are over make room for the rest. A
+trial ends when its goal is reached and its last turn has ended, or when it can no longer succeed.
+What is judged, and when, is as `turns` judges a recorded drive (a test holds the two together).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from countersteer.car.car import Car
+from countersteer.car.parameter import Array, Scalar
+from countersteer.course.course import Course
+from countersteer.drivers.driver import Driver
+from countersteer.errors import InputError
+from countersteer.evaluation.population import Drawn
+from countersteer.evaluation.turns import (
+    LONGEST,
+    SLOW,
+    STRAIGHT_FOR,
+    STRAIGHT_RATE,
+    STRAIGHT_SLIP,
+    Judge,
+)
+from countersteer.sensing import sonar
+from countersteer.simulator import Loop, Plan, Simulator, Surroundings, begin, padded, tick
+from countersteer.world import planar
+from countersteer.world.state import State
+
+LANES = 128  # trials of a block
+LOOK = 0.005  # s between two samples that are judged, as in truth.csv
+
+DRIVING, REACHED, TOUCHED, ROLLED, STALLED, LOST, LATE = range(7)
+STATUS = (
+    "driving", "goal reached", "touched a wall", "rolled over", "stalled", "lost its state",
+    "out of time",
+)  # fmt: skip
+
+
+class Line(NamedTuple):
+    """The centre line, and what the judge must know of the course."""
+
+    begin: Array  # (n, 2) of each piece
+    along: Array  # (n, 2) direction
+    length: Array  # (n,)
+    mark: Array  # (n,) distance of the beginning
+    whole: Scalar  # length of the line, or inf where it is open
+    near: Scalar  # m along the line between two samples, at most
+    goal: Scalar
+    bearings: Array  # (turns,) heading of the corridor behind each turn
+
+
+class Turns(NamedTuple):
+    """What is known of each turn; arrays of one number a turn. Times are inf until they come."""
+
+    begin: Array
+    end: Array
+    stirred: Array  # 1 once the car has not gone straight in it
+    calm_since: Array
+    entry_speed: Array
+    peak_sideslip: Array
+    peak_yaw_rate: Array
+    error: Array  # heading less the corridor's, at the end
+
+
+class Score(NamedTuple):
+    """A trial so far."""
+
+    status: Scalar
+    distance: Scalar
+    furthest: Scalar
+    furthest_at: Scalar
+    goal_time: Scalar
+    stirred_at: Scalar
+    turns: Turns
+
+
+def line_of(course: Course, laps: int, dtype: Any) -> Line:
+    """The centre line as arrays."""
+    steps = np.diff(course.line, axis=0)
+    lengths = np.hypot(*steps.T)
+    bearings = course.start[2] + np.cumsum([t.angle for t in course.turns_ahead(laps)])
+    values = (
+        course.line[:-1],
+        steps / lengths[:, None],
+        lengths,
+        course.marks[:-1],
+        course.length if course.closed else math.inf,
+        1.5 * (course.width or 1.0),
+        course.lap_end(laps),
+        bearings,
+    )
+    return Line(*(np.asarray(value, dtype) for value in values))
+
+
+def initial_score(course: Course, turns: int, dtype: Any) -> Score:
+    """Before the first sample."""
+    distance = dtype(course.start_distance)
+    never, zero = np.full(turns, np.inf, dtype), np.zeros(turns, dtype)
+    table = Turns(never, never, zero, zero, zero, zero, zero, zero)
+    inf = dtype(np.inf)
+    return Score(np.int32(DRIVING), distance, distance, dtype(0), inf, dtype(0), table)
+
+
+def follow(line: Line, score: Score, state: State, turn: Scalar, time: Scalar) -> Score:
+    """The score with one sample more; a trial that is over stays as it is."""
+    motion = state.motion
+    speed = jnp.sqrt(motion.vx**2 + motion.vy**2 + 1e-12)
+    slip = jnp.where(speed > SLOW, jnp.abs(jnp.arctan2(motion.vy, motion.vx)), 0.0)
+    rate = jnp.abs(motion.yaw_rate)
+    calm = (rate < STRAIGHT_RATE) & (slip < STRAIGHT_SLIP)
+
+    distance = _progress(line, motion.x, motion.y, score.distance)
+    ahead = distance > score.furthest + 0.05
+    goal_time = jnp.where(
+        jnp.isinf(score.goal_time) & (distance >= line.goal), time, score.goal_time
+    )
+    stirred_at = jnp.where(calm, score.stirred_at, time)
+
+    old = score.turns
+    number = jnp.arange(old.begin.shape[0])
+    begins = jnp.isinf(old.begin) & (number < turn)
+    begin = jnp.where(begins, time, old.begin)
+    under_way = (begin <= time) & jnp.isinf(old.end)
+    stirred = jnp.where(under_way & ~calm, 1.0, old.stirred)
+    calm_since = jnp.where(calm & ~begins, old.calm_since, time)
+    late = time - begin >= LONGEST - 1e-4
+    settled = (stirred > 0) & calm & (time - calm_since >= STRAIGHT_FOR - 1e-4)
+    ends = under_way & (late | settled)
+    error = motion.heading - line.bearings
+    error = error - 2 * math.pi * jnp.round(error / (2 * math.pi))
+    turns = Turns(
+        begin,
+        jnp.where(ends, time, old.end),
+        stirred,
+        calm_since,
+        jnp.where(begins, speed, old.entry_speed),
+        jnp.where(under_way, jnp.maximum(old.peak_sideslip, slip), old.peak_sideslip),
+        jnp.where(under_way, jnp.maximum(old.peak_yaw_rate, rate), old.peak_yaw_rate),
+        jnp.where(ends, error, old.error),
+    )
+    reached = ~jnp.isinf(goal_time) & (
+        (time - stirred_at >= STRAIGHT_FOR - 1e-4) | (time - goal_time >= LONGEST)
+    )
+    furthest_at = jnp.where(ahead, time, score.furthest_at)
+    stalled = jnp.isinf(goal_time) & (time - furthest_at > Judge.STALLED)
+    status = jnp.int32(DRIVING)
+    for found, name in (
+        (stalled, STALLED),
+        (reached, REACHED),
+        (state.rolled_over > 0, ROLLED),
+        (state.wall_contacts > 0, TOUCHED),
+        (~jnp.isfinite(motion.x + motion.vx + motion.yaw_rate), LOST),
+    ):
+        status = jnp.where(found, jnp.int32(name), status)
+    new = Score(
+        status,
+        distance,
+        jnp.where(ahead, distance, score.furthest),
+        furthest_at,
+        goal_time,
+        stirred_at,
+        turns,
+    )
+    over = score.status != DRIVING
+    return jax.tree.map(lambda a, b: jnp.where(over, a, b), score, new)
+
+
+def _progress(line: Line, x: Scalar, y: Scalar, last: Scalar) -> Scalar:
+    """As `course.progress`: the nearest place of the line not far from the last."""
+    dx, dy = x - line.begin[:, 0], y - line.begin[:, 1]
+    on = jnp.clip(dx * line.along[:, 0] + dy * line.along[:, 1], 0.0, line.length)
+    away = (dx - on * line.along[:, 0]) ** 2 + (dy - on * line.along[:, 1]) ** 2
+    where = line.mark + on
+    rounds = jnp.where(jnp.isinf(line.whole), 0.0, jnp.round((last - where) / line.whole))
+    where = where + jnp.where(jnp.isinf(line.whole), 0.0, rounds * line.whole)
+    away = jnp.where(jnp.abs(where - last) <= line.near, away, jnp.inf)
+    best = jnp.argmin(away)
+    return jnp.where(jnp.isinf(away[best]), last, where[best])
+
+
+class Trials(NamedTuple):
+    """What a batch of trials runs with; leaves have an axis of trials in front."""
+
+    car: Car
+    driver: Any  # leaves that all trials share have no such axis
+    charge: Array
+    pose: Array  # (n, 3)
+    seed: Array
+
+
+class Shared(NamedTuple):
+    """What all trials share."""
+
+    walls: Array
+    corners: Array
+    loss: Scalar
+    line: Line
+    score: Score  # before the first sample
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _rollout(
+    mesh: Mesh, plan: Plan, ticks: int, shared: Shared, varied: Trials, driver: Any
+) -> Score:
+    """A block of trials on each core; `driver` holds None where the trials' drivers differ."""
+    cut, same = PartitionSpec("core"), PartitionSpec()
+
+    def on_core(shared: Shared, varied: Trials, driver: Any) -> Score:
+        def one(own: Trials) -> Score:
+            mine = jax.tree.map(
+                lambda a, b: b if a is None else a, driver, own.driver, is_leaf=lambda x: x is None
+            )
+            return _trial(plan, ticks, shared, own._replace(driver=mine))
+
+        return jax.vmap(one, axis_name="trial")(varied)
+
+    run = jax.shard_map(
+        on_core, mesh=mesh, in_specs=(same, cut, same), out_specs=cut, check_vma=False
+    )
+    return run(shared, varied, driver)
+
+
+def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> Score:
+    """One trial of at most so many ticks; a block goes on until all its trials are over."""
+    every = max(1, round(LOOK / plan.dt))
+    key, driver_key = jax.random.split(jax.random.key(own.seed))
+    around = Surroundings(shared.walls, shared.corners, key, shared.loss)
+    zero = jnp.zeros_like(own.charge)
+    pose = (own.pose[0], own.pose[1], own.pose[2])
+    loop = begin(plan, own.car, own.driver, pose, (zero, zero, zero), own.charge, driver_key)
+
+    def one(loop: Loop, _: None) -> tuple[Loop, None]:
+        return tick(plan, own.car, around, own.driver, loop)[0], None
+
+    def look(carry: tuple[Loop, Score, Scalar]) -> tuple[Loop, Score, Scalar]:
+        loop, score, _ = carry
+        time = plan.dt * loop.tick.astype(score.distance.dtype)
+        turn = jnp.asarray(getattr(loop.memory, "turn", 0))
+        score = follow(shared.line, score, loop.state, turn, time)
+        loop, _ = jax.lax.scan(one, loop, None, length=every)
+        # Common to the block, so that the loop's end is.
+        going = jax.lax.pmax((score.status == DRIVING).astype(jnp.int32), "trial")
+        return loop, score, going
+
+    def goes_on(carry: tuple[Loop, Score, Scalar]) -> Any:
+        return (carry[2] > 0) & (carry[0].tick <= ticks)
+
+    loop, score, _ = jax.lax.while_loop(goes_on, look, (loop, shared.score, jnp.int32(1)))
+    late = score.status == DRIVING
+    return score._replace(status=jnp.where(late, jnp.int32(LATE), score.status))
+
+
+def rollouts(
+    simulator: Simulator,
+    drawn: Drawn,
+    drivers: Sequence[Driver],
+    seeds: Sequence[int],
+    laps: int,
+    longest: float,
+    report: Callable[[int, int], None] = lambda *_: None,
+    lanes: int = LANES,
+) -> Score:
+    """One trial for each seed, its driver and what was drawn for it.
+
+    `simulator` says how: course, link, step, estimate; its car is the nominal one. In the precision
+    of the leaves of `drawn`. Leaves of the result have an axis of trials in front.
+    """
+    course = simulator.course
+    if course is None or course.goal_distance is None:
+        raise InputError("trials need a course with a goal")
+    dtype = np.asarray(drawn.charge).dtype
+    plan = simulator.plan()._replace(slots=planar.delay_slots(drawn.cars, simulator.dt))
+    walls = padded(course.walls, dtype)
+    line = line_of(course, laps, dtype)
+    start = initial_score(course, len(line.bearings), dtype.type)
+    shared = Shared(walls, sonar.edges(walls), dtype.type(simulator.link.loss), line, start)
+    common, own = _common(drivers, dtype)
+    varied = Trials(drawn.cars, own, drawn.charge, drawn.pose, np.asarray(seeds, np.int32))
+    mesh = Mesh(np.array(jax.devices()), ("core",))
+    width = lanes * mesh.size
+    ticks = round(longest / simulator.dt)
+    scores, count = [], len(seeds)
+    for first in range(0, count, width):
+        picked = np.arange(first, first + width) % count
+        score = _rollout(mesh, plan, ticks, shared, _rows(varied, picked), common)
+        scores.append(_rows(score, np.arange(min(width, count - first))))
+        report(min(first + width, count), count)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *scores)
+
+
+def _rows(tree: Any, picked: np.ndarray) -> Any:
+    """The picked trials of a batch."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[picked], tree)
+
+
+def _common(drivers: Sequence[Driver], dtype: Any) -> tuple[Any, Any]:
+    """Leaves that all drivers share, and stacked those that differ; None where it is the other."""
+    flat = [jax.tree.flatten(driver) for driver in drivers]
+    treedef = flat[0][1]
+    common, own = [], []
+    for leaves in zip(*(leaves for leaves, _ in flat), strict=True):
+        arrays = [np.asarray(leaf) for leaf in leaves]
+        arrays = [a.astype(dtype) if a.dtype.kind == "f" else a for a in arrays]
+        same = all(np.array_equal(arrays[0], a, equal_nan=a.dtype.kind == "f") for a in arrays[1:])
+        common.append(arrays[0] if same else None)
+        own.append(None if same else np.stack(arrays))
+    return jax.tree.unflatten(treedef, common), jax.tree.unflatten(treedef, own)
