@@ -6,22 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.parameter import Scalar
+from countersteer.estimation.estimate import Estimate
 from countersteer.sensing.suite import Readings
 
 ROLLING = 1.0  # yaw rate (rad/s) under which the wheels are taken to roll, so that they tell speed
 TRUST = 0.25  # part of the difference to the wheels' speed that a report of theirs takes away
 FADE = 0.3  # s in which sideways speed is forgotten while the wheels roll
-
-
-class Estimate(NamedTuple):
-    """The motion of the car as far as it is known. SI, radians; pose of the centre of mass."""
-
-    x: Scalar
-    y: Scalar
-    heading: Scalar  # unwrapped
-    vx: Scalar  # along the body's axes
-    vy: Scalar
-    yaw_rate: Scalar
 
 
 class Memory(NamedTuple):
