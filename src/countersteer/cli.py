@@ -108,9 +108,10 @@ def parser() -> Parser:
         )
         made.add_argument(
             "--estimate",
-            choices=("filter", "truth"),
+            choices=("filter", "reckoning", "truth"),
             default="filter",
-            help="what the driver knows of its motion (default filter: from the sensors)",
+            help="what the driver knows of its motion: by the velocity filter (default), by dead "
+            "reckoning, both from the sensors; or the truth",
         )
 
     drive = verb("drive", "one closed-loop drive over a course", run_drive)
@@ -356,6 +357,7 @@ def run_drive(options: argparse.Namespace) -> int:
         options.seed,
         charge,
         start=start,
+        nominal=load_car(options.car),
     )
     # A lap at a crawl still ends.
     longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
@@ -479,6 +481,7 @@ def run_replay(options: argparse.Namespace) -> int:
         course,
         car,
         driver,
+        estimate="reckoning",  # which such a driver does not look at
         dt=options.dt,
         seed=options.seed,
         start=pose,

@@ -28,8 +28,8 @@ from countersteer.car.car import Car, Wheels
 from countersteer.car.parameter import Array, Scalar
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver, Heard, Observation
-from countersteer.estimation import dead_reckoning
-from countersteer.estimation.dead_reckoning import Estimate
+from countersteer.estimation import dead_reckoning, velocity
+from countersteer.estimation.estimate import Estimate
 from countersteer.link.link import ONBOARD, Channel, Link, exchange, initial_channel
 from countersteer.sensing import sonar, suite
 from countersteer.sensing.suite import Reading, Readings
@@ -38,6 +38,7 @@ from countersteer.world.planar import Command
 from countersteer.world.state import Motion, State
 
 PIECE = 0.5  # s of car time that are scanned at once; records are flushed between pieces
+FILTERING = 0.005  # s between two steps of the velocity filter
 
 
 class Plan(NamedTuple):
@@ -49,7 +50,8 @@ class Plan(NamedTuple):
     delay: int
     timeout: int  # 0: none
     onboard: bool
-    truth: bool  # the estimate is the state itself
+    estimate: str  # as in `Simulator`
+    filtering: int
     sensors: suite.Periods
     slots: int  # of the delay lines
 
@@ -61,6 +63,7 @@ class Surroundings(NamedTuple):
     corners: Array  # (2n, 3), from `sonar.edges`
     key: jax.Array
     loss: Scalar
+    nominal: Car  # what the estimate knows of the car
 
 
 class Loop(NamedTuple):
@@ -69,7 +72,7 @@ class Loop(NamedTuple):
     tick: Scalar
     state: State
     sensors: suite.Memory
-    estimate: dead_reckoning.Memory
+    estimate: Any  # the filter's memory
     command: Command  # the driver's last
     up: Channel | None
     down: Channel | None
@@ -97,7 +100,8 @@ class Simulator:
 
     `course` may be None: open floor. `car` is what is simulated; a driver knows only what it was
     made for. The precision is that of the car's leaves: 64-bit leaves run in 64 bits.
-    `estimate` is "filter" (dead reckoning from the sensors) or "truth".
+    `estimate` is "filter" (the velocity filter, which knows the `nominal` car: by default the car
+    itself), "reckoning" (dead reckoning) or "truth".
     """
 
     course: Course | None
@@ -110,19 +114,21 @@ class Simulator:
     charge: float = 1.0
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: tuple[float, float, float] | None = None  # instead of the course's
+    nominal: Car | None = None
 
     def plan(self) -> Plan:
         """Periods in whole ticks, at least one each."""
         ticks = lambda time: max(1, round(time / self.dt))  # noqa: E731  # used twice
-        timeout = self.link.timeout
+        timeout, control = self.link.timeout, ticks(self.link.control_period)
         return Plan(
             self.dt,
-            ticks(self.link.control_period),
+            control,
             ticks(self.link.telemetry_period),
             round(self.link.delay / self.dt),
             0 if math.isinf(timeout) else ticks(timeout),
             self.link.onboard,
-            self.estimate == "truth",
+            self.estimate,
+            control * max(1, round(FILTERING / self.dt / control)),
             suite.periods(self.car, self.dt),
             planar.delay_slots(self.car, self.dt),
         )
@@ -162,10 +168,23 @@ class Simulator:
         pose = self.start or (self.course.start if self.course else (0.0, 0.0, 0.0))
         walls = padded(self.course.walls if self.course else np.zeros((0, 4)), dtype)
         key, driver_key = jax.random.split(jax.random.key(self.seed))
-        around = Surroundings(walls, sonar.edges(walls), key, dtype.type(self.link.loss))
-        return around, begin(
-            plan, self.car, self.driver, pose, self.velocity, self.charge, driver_key
+        nominal = jax.tree.map(dtype.type, self.nominal or self.car)
+        loss = dtype.type(self.link.loss)
+        around = Surroundings(walls, sonar.edges(walls), key, loss, nominal)
+        # What the driver takes for its start is the course's, wherever the car stands.
+        believed = self.course.start if self.course else pose
+        loop = begin(
+            plan,
+            self.car,
+            nominal,
+            self.driver,
+            pose,
+            believed,
+            self.velocity,
+            self.charge,
+            driver_key,
         )
+        return around, loop
 
     def _stepped(
         self, plan: Plan, ticks: int, around: Surroundings, loop: Loop
@@ -175,7 +194,7 @@ class Simulator:
         memory = loop.memory
         loop = loop._replace(memory=())
         for _ in range(ticks // plan.control):
-            loop, observation = jitted_observe(plan, loop)
+            loop, observation = jitted_observe(plan, around, loop)
             command, memory = self.driver.act(memory, jax.tree.map(np.asarray, observation))
             loop = loop._replace(command=_like(command, loop.command))
             loop, record = hold(plan, self.car, around, loop)
@@ -188,15 +207,17 @@ class Simulator:
 def begin(
     plan: Plan,
     car: Car,
+    nominal: Car,
     driver: Driver,
     pose: tuple[Scalar, Scalar, Scalar],
-    velocity: tuple[Scalar, Scalar, Scalar],
+    believed: tuple[Scalar, Scalar, Scalar],
+    moving: tuple[Scalar, Scalar, Scalar],
     charge: Scalar,
     key: jax.Array,
 ) -> Loop:
-    """The loop before its first tick; `key` is the driver's."""
+    """The loop before its first tick, with the pose that the driver believes; `key` is its."""
     dtype = jnp.result_type(car.body.mass)
-    state = planar.initial_state(car, plan.dt, pose, velocity, charge, plan.slots)
+    state = planar.initial_state(car, plan.dt, pose, moving, charge, plan.slots)
     sensors = suite.initial_memory(car, state.motion)
     zero = dtype.type(0)
     still = Command(zero, zero)
@@ -204,7 +225,9 @@ def begin(
     if not plan.onboard:
         up = initial_channel(still, plan.control, plan.delay)
         down = initial_channel(sensors.readings, plan.telemetry, plan.delay)
-    estimate = dead_reckoning.initial_memory(pose, dtype)
+    estimate: Any = dead_reckoning.initial_memory(believed, dtype)
+    if plan.estimate == "filter":
+        estimate = velocity.initial_memory(nominal, believed, dtype)
     memory = driver.reset(key)
     if not jax.tree_util.all_leaves([driver]):
         memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
@@ -227,7 +250,7 @@ def tick(
     """One tick with a driver that JAX can trace."""
 
     def act(loop: Loop) -> Loop:
-        loop, observation = observe(plan, loop)
+        loop, observation = observe(plan, around, loop)
         command, memory = driver.act(loop.memory, observation)
         memory = jax.tree.map(_like, memory, loop.memory)
         return loop._replace(command=jax.tree.map(_like, command, loop.command), memory=memory)
@@ -247,13 +270,24 @@ def hold(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loop, 
     )
 
 
-def observe(plan: Plan, loop: Loop) -> tuple[Loop, Observation]:
+def observe(plan: Plan, around: Surroundings, loop: Loop) -> tuple[Loop, Observation]:
     """What the driver is told at this tick: the readings that it has heard, and the estimate."""
     readings = loop.sensors.readings if loop.down is None else loop.down.latest
-    memory = dead_reckoning.update(loop.estimate, readings, plan.dt)
     motion = loop.state.motion
-    known = memory.estimate
-    if plan.truth:
+    if plan.estimate == "filter":
+
+        def filtered(memory: velocity.Memory) -> velocity.Memory:
+            return velocity.update(
+                around.nominal, memory, readings, loop.command, loop.tick, plan.dt
+            )
+
+        now = loop.tick % plan.filtering == 0
+        memory = jax.lax.cond(now, filtered, lambda same: same, loop.estimate)
+        known = velocity.estimate(memory)
+    else:
+        memory = dead_reckoning.update(loop.estimate, readings, plan.dt)
+        known = memory.estimate
+    if plan.estimate == "truth":
         known = Estimate(motion.x, motion.y, motion.heading, motion.vx, motion.vy, motion.yaw_rate)
 
     def heard(reading: Reading) -> Heard:

@@ -20,9 +20,10 @@ from countersteer.errors import InputError
 STRAIGHT, SPIN, STOP, SETTLE = 0, 1, 2, 3
 SPEED = 2.0  # m/s, unless another is asked for
 NEWS = 0.03  # m, standard deviation of what the front sonar says of the corner's distance
-DOUBT = 0.35  # m, standard deviation of that distance as a corridor begins
+DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
 SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
-GATE = 3.5  # standard deviations beyond which a reading is a spike
+GATE = 3.0  # standard deviations beyond which a reading is a spike
+AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
 
 
 class Memory(NamedTuple):
@@ -36,6 +37,9 @@ class Memory(NamedTuple):
     calm: Scalar  # s for which the car has gone straight
     corner: Scalar  # distance along the corridor to the next corner, m
     doubt: Scalar  # its variance, m²
+    heard: Scalar  # the front sonar's last reading, m
+    odd: Scalar  # by how much the last that was not believed differed, m
+    odds: Scalar  # how many in a row agreed on that
     straight: straighten.Memory
 
 
@@ -101,9 +105,8 @@ class DriftTurn:
     def reset(self, key: jax.Array) -> Memory:
         """Straight ahead, a corridor's length away from the first corner."""
         gap = jnp.asarray(self.gaps)[0]
-        return Memory(
-            STRAIGHT, 0, 0.0, 0.0, 1.0, 0.0, gap, DOUBT**2 + 0.0 * gap, self.straight.reset(key)
-        )
+        first = (STRAIGHT, 0, 0.0, 0.0, 1.0, 0.0, gap, DOUBT**2, math.inf, 0.0, 0)
+        return Memory(*first, self.straight.reset(key))
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
@@ -113,7 +116,7 @@ class DriftTurn:
         estimate = seen.estimate
         angle = jnp.asarray(self.angles)[memory.turn]
         gap = jnp.asarray(self.gaps)[memory.turn + 1]
-        corner, doubt = self._approach(memory, seen, straight.bearing, angle, dt)
+        corner, doubt, spikes = self._approach(memory, seen, straight.bearing, angle, dt)
 
         speed = jnp.maximum(estimate.vx, 0.5)
         lead = interpolate(own.speeds, own.lead, speed) * jnp.tan(
@@ -174,34 +177,45 @@ class DriftTurn:
             calm,
             jnp.where(begins, gap + corner * jnp.cos(angle), corner),
             jnp.where(begins, DOUBT**2, doubt),
+            *spikes,
             straight,
         )
 
     def _approach(
         self, memory: Memory, seen: Observation, bearing: Scalar, angle: Scalar, dt: Scalar
-    ) -> tuple[Scalar, Scalar]:
+    ) -> tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar]]:
         """Distance to the next corner and its variance: odometry, and the wall ahead.
 
         The wall behind a corner by an angle a stands w/2 beyond it, its normal turned by 90° - a
         from the heading: from a distance c before the corner it is c sin a + w/2 away, and an
         echo comes from within the cone, so from as much farther as the cone is short of the normal.
-        A reading that cannot be is a spike, short or long; so is one that stands still while the
-        car moves. None costs any delay: one that can be is believed at once.
+        A reading that odometry does not expect is a spike, until several in a row agree; one that
+        stands still while the car moves tells nothing. One that is expected is believed at once.
         """
         error = seen.estimate.heading - bearing
         along = seen.estimate.vx * jnp.cos(error) - seen.estimate.vy * jnp.sin(error)
         corner = memory.corner - dt * along
         doubt = memory.doubt + dt * SLIPPING**2
         heard = seen.sonar[self.front]
+        came = heard.age <= dt + 1e-9
+        stuck = (heard.value == memory.heard) & (along > 0.5)
+        looks = (jnp.abs(error) < 0.3) & (memory.phase == STRAIGHT) & jnp.isfinite(heard.value)
+        fresh = came & looks & ~stuck
         sine = jnp.maximum(jnp.sin(jnp.abs(angle)), 0.5)
-        normal = jnp.maximum(jnp.abs(math.pi / 2 - jnp.abs(angle)) - self.cone, 0.0)
-        range_ = heard.value * jnp.cos(normal)
-        told = (range_ - self.width / 2) / sine + self.front_x
-        news = told - corner
+        short = jnp.maximum(jnp.abs(math.pi / 2 - jnp.abs(angle)) - self.cone, 0.0)
+        told = (heard.value * jnp.cos(short) - self.width / 2) / sine + self.front_x
+        news = jnp.where(fresh, told - corner, 0.0)
         likely = news**2 < GATE**2 * (doubt + NEWS**2)
-        fresh = (heard.age <= dt + 1e-9) & (jnp.abs(error) < 0.3) & (memory.phase == STRAIGHT)
-        gain = jnp.where(fresh & likely, doubt / (doubt + NEWS**2), 0.0)
-        return corner + jnp.where(gain > 0, gain * news, 0.0), (1 - gain) * doubt
+        agrees = jnp.where(jnp.abs(news - memory.odd) < AGREE, memory.odds + 1, 1)
+        odds = jnp.where(fresh, jnp.where(likely, 0, agrees), memory.odds)
+        doubt = jnp.where(odds >= INSIST, DOUBT**2, doubt)
+        gain = jnp.where(fresh & (likely | (odds >= INSIST)), doubt / (doubt + NEWS**2), 0.0)
+        spikes = (
+            jnp.where(came, heard.value, memory.heard),
+            jnp.where(fresh, (1 - gain) * news, memory.odd),
+            odds,
+        )
+        return corner + gain * news, (1 - gain) * doubt, spikes
 
 
 DEFAULT = Turning(

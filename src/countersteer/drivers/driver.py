@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 
 from countersteer.car.parameter import Scalar
-from countersteer.estimation.dead_reckoning import Estimate
+from countersteer.estimation.estimate import Estimate
 from countersteer.world.planar import Command
 
 __all__ = ["Command", "Driver", "Heard", "Observation"]

@@ -6,22 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.parameter import Scalar
+from countersteer.estimation.estimate import Estimate
 from countersteer.sensing.suite import Readings
 
 ROLLING = 1.0  # yaw rate (rad/s) under which the wheels are taken to roll, so that they tell speed
 TRUST = 0.25  # part of the difference to the wheels' speed that a report of theirs takes away
 FADE = 0.3  # s in which sideways speed is forgotten while the wheels roll
-
-
-class Estimate(NamedTuple):
-    """The motion of the car as far as it is known. SI, radians; pose of the centre of mass."""
-
-    x: Scalar
-    y: Scalar
-    heading: Scalar  # unwrapped
-    vx: Scalar  # along the body's axes
-    vy: Scalar
-    yaw_rate: Scalar
 
 
 class Memory(NamedTuple):
@@ -35,7 +25,7 @@ class Memory(NamedTuple):
 
 def initial_memory(pose: tuple[float, float, float], dtype: np.dtype) -> Memory:
     """At rest at a known pose."""
-    estimate = Estimate(*(jnp.asarray(value, dtype) for value in (*pose, 0, 0, 0)))
+    estimate = Estimate(*(jnp.asarray(value, dtype) for value in (*pose, 0.0, 0.0, 0.0)))
     none = np.int32(0)
     return Memory(estimate, none, none, none)
 

@@ -203,6 +203,8 @@ class Shared(NamedTuple):
     walls: Array
     corners: Array
     loss: Scalar
+    nominal: Car  # the one that the filter knows
+    start: tuple[Scalar, Scalar, Scalar]  # the one that the driver believes
     line: Line
     score: Score  # before the first sample
 
@@ -233,10 +235,21 @@ def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> Score:
     """One trial of at most so many ticks; a block goes on until all its trials are over."""
     every = max(1, round(LOOK / plan.dt))
     key, driver_key = jax.random.split(jax.random.key(own.seed))
-    around = Surroundings(shared.walls, shared.corners, key, shared.loss)
+    around = Surroundings(shared.walls, shared.corners, key, shared.loss, shared.nominal)
     zero = jnp.zeros_like(own.charge)
     pose = (own.pose[0], own.pose[1], own.pose[2])
-    loop = begin(plan, own.car, own.driver, pose, (zero, zero, zero), own.charge, driver_key)
+    still = (zero, zero, zero)
+    loop = begin(
+        plan,
+        own.car,
+        shared.nominal,
+        own.driver,
+        pose,
+        shared.start,
+        still,
+        own.charge,
+        driver_key,
+    )
 
     def one(loop: Loop, _: None) -> tuple[Loop, None]:
         return tick(plan, own.car, around, own.driver, loop)[0], None
@@ -282,7 +295,15 @@ def rollouts(
     walls = padded(course.walls, dtype)
     line = line_of(course, laps, dtype)
     start = initial_score(course, len(line.bearings), dtype.type)
-    shared = Shared(walls, sonar.edges(walls), dtype.type(simulator.link.loss), line, start)
+    shared = Shared(
+        walls,
+        sonar.edges(walls),
+        dtype.type(simulator.link.loss),
+        jax.tree.map(dtype.type, simulator.nominal or simulator.car),
+        tuple(map(dtype.type, course.start)),
+        line,
+        start,
+    )
     common, own = _common(drivers, dtype)
     varied = Trials(drawn.cars, own, drawn.charge, drawn.pose, np.asarray(seeds, np.int32))
     mesh = Mesh(np.array(jax.devices()), ("core",))

@@ -1,0 +1,81 @@
+"""The two steps of an extended Kalman filter, for one car in plain scalars.
+
+A filter of some eight states is all sparse: its matrices are written out, and where Python knows
+a number to be zero nothing is computed. So a batch is a `vmap` without a matrix in it.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+import jax.numpy as jnp
+
+from countersteer.car.parameter import Scalar
+
+Covariance: TypeAlias = tuple[tuple[Scalar, ...], ...]  # row i holds its columns i, i + 1, ...
+Row: TypeAlias = Mapping[int, Scalar]  # a row of a matrix: its entries that are not zero
+
+
+def diagonal(deviations: Sequence[Scalar]) -> Covariance:
+    """Of independent states with these standard deviations."""
+    n = len(deviations)
+    return tuple(
+        tuple(deviations[i] ** 2 if j == i else 0.0 * deviations[i] for j in range(i, n))
+        for i in range(n)
+    )
+
+
+def entry(covariance: Covariance, i: int, j: int) -> Scalar:
+    """Of the covariance of the states i and j."""
+    return covariance[min(i, j)][abs(i - j)]
+
+
+def predict(covariance: Covariance, moves: Mapping[int, Row], noise: Row) -> Covariance:
+    """(I + A) P (I + A)ᵀ + Q: `moves` holds A's rows, `noise` the diagonal of Q."""
+    n = len(covariance)
+    full = [[entry(covariance, i, j) for j in range(n)] for i in range(n)]
+    for i, row in moves.items():  # P becomes (I + A) P; rows that others use are still the old ones
+        full[i] = [
+            full[i][j] + sum(a * entry(covariance, k, j) for k, a in row.items()) for j in range(n)
+        ]
+    return tuple(
+        tuple(
+            full[i][j]
+            + sum(a * full[i][k] for k, a in moves.get(j, {}).items())
+            + (noise.get(i, 0.0) if i == j else 0.0)
+            for j in range(i, n)
+        )
+        for i in range(n)
+    )
+
+
+def correct(
+    mean: Sequence[Scalar],
+    covariance: Covariance,
+    row: Row,
+    residual: Scalar,
+    noise: Scalar,
+    valid: Scalar,
+    gate: float,
+) -> tuple[tuple[Scalar, ...], Covariance, Scalar]:
+    """One scalar measurement: mean, covariance and whether it was taken.
+
+    `row` is the measurement's derivative by the states, `residual` measured less expected, `noise`
+    its variance. Nothing changes where `valid` is false, or where the residual exceeds `gate`
+    standard deviations: what comes in may be NaN there. A variance never falls below what the
+    measurement's own noise leaves, whatever rounding does: P_ii >= h-part is kept by subtracting
+    p pᵀ / S, whose every entry is bounded by the prior's.
+    """
+    n = len(mean)
+    across = [sum(a * entry(covariance, i, k) for k, a in row.items()) for i in range(n)]
+    spread = sum(a * across[k] for k, a in row.items()) + noise
+    taken = valid & (residual**2 <= gate**2 * spread)
+    weight = jnp.where(taken, 1 / spread, 0.0)
+    residual = jnp.where(taken, residual, 0.0)
+    gain = [a * weight for a in across]
+    return (
+        tuple(m + g * residual for m, g in zip(mean, gain, strict=True)),
+        tuple(
+            tuple(covariance[i][j - i] - gain[i] * across[j] for j in range(i, n)) for i in range(n)
+        ),
+        taken,
+    )
