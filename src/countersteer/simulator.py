@@ -283,7 +283,7 @@ def observe(plan: Plan, around: Surroundings, loop: Loop) -> tuple[Loop, Observa
 
         now = loop.tick % plan.filtering == 0
         memory = jax.lax.cond(now, filtered, lambda same: same, loop.estimate)
-        known = velocity.estimate(memory)
+        known = velocity.estimate(around.nominal, memory, plan.dt)
     else:
         memory = dead_reckoning.update(loop.estimate, readings, plan.dt)
         known = memory.estimate

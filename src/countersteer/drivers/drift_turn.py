@@ -116,21 +116,20 @@ class DriftTurn:
         estimate = seen.estimate
         angle = jnp.asarray(self.angles)[memory.turn]
         gap = jnp.asarray(self.gaps)[memory.turn + 1]
-        corner, doubt, spikes = self._approach(memory, seen, straight.bearing, angle, dt)
+        corner, doubt, spikes = self._approach(memory, seen, straight.error, angle, dt)
 
         speed = jnp.maximum(estimate.vx, 0.5)
         lead = interpolate(own.speeds, own.lead, speed) * jnp.tan(
             jnp.minimum(jnp.abs(angle), 2.1) / 2
         )
-        lined_up = jnp.abs(estimate.heading - straight.bearing) < 0.5
+        lined_up = jnp.abs(straight.error) < 0.5
         near = ((corner < lead) & lined_up) | (self.linked > 0)
         begins = (memory.phase == STRAIGHT) & near & (angle != 0)
-        from_here = straight.bearing + (1 - self.carry) * (estimate.heading - straight.bearing)
-        bearing = jnp.where(begins, from_here + angle, straight.bearing)
+        straight = self.straight.turned(straight, angle + (1 - self.carry) * straight.error, begins)
         hand = jnp.where(begins, jnp.sign(angle), memory.hand)
         entry = jnp.where(begins, speed, memory.entry)
 
-        left_over = hand * (bearing - estimate.heading)
+        left_over = -hand * straight.error
         rate = hand * estimate.yaw_rate
         missing = left_over - self.stop_angle.angle(speed, jnp.maximum(rate, 0.0))
         late = now - memory.since > self.longest
@@ -145,11 +144,7 @@ class DriftTurn:
         changed = begins | stops | settles | ends
 
         slip = jnp.arctan2(estimate.vy + self.front_axle * estimate.yaw_rate, speed)
-        hold = (
-            own.hold_p * (bearing - estimate.heading)
-            - own.hold_d * estimate.yaw_rate
-            + own.hold_slip * slip
-        )
+        hold = -own.hold_p * straight.error - own.hold_d * estimate.yaw_rate + own.hold_slip * slip
         spin, stop = own.spin(entry, rate), own.stop(entry, missing)
         on = self.straight.command(straight, seen, self.straight.speed)
         steering, throttle = on.steering, on.throttle
@@ -162,12 +157,7 @@ class DriftTurn:
             throttle = jnp.where(phase == which, power, throttle)
         limit = self.straight.limit
         command = Command(jnp.clip(throttle, -1.0, 1.0), jnp.clip(steering, -limit, limit))
-        straight = straight._replace(
-            bearing=bearing,
-            # A new corridor: nothing is known of the offset but what the sonars will tell.
-            offset=jnp.where((phase == SPIN) | (phase == STOP), 0.0, straight.offset),
-            integral=jnp.where(phase == STRAIGHT, straight.integral, 0.0),
-        )
+        integral = jnp.where(phase == STRAIGHT, straight.integral, 0.0)
         return command, Memory(
             phase,
             memory.turn + begins,
@@ -178,11 +168,11 @@ class DriftTurn:
             jnp.where(begins, gap + corner * jnp.cos(angle), corner),
             jnp.where(begins, DOUBT**2, doubt),
             *spikes,
-            straight,
+            straight._replace(integral=integral),
         )
 
     def _approach(
-        self, memory: Memory, seen: Observation, bearing: Scalar, angle: Scalar, dt: Scalar
+        self, memory: Memory, seen: Observation, error: Scalar, angle: Scalar, dt: Scalar
     ) -> tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar]]:
         """Distance to the next corner and its variance: odometry, and the wall ahead.
 
@@ -192,7 +182,6 @@ class DriftTurn:
         A reading that odometry does not expect is a spike, until several in a row agree; one that
         stands still while the car moves tells nothing. One that is expected is believed at once.
         """
-        error = seen.estimate.heading - bearing
         along = seen.estimate.vx * jnp.cos(error) - seen.estimate.vy * jnp.sin(error)
         corner = memory.corner - dt * along
         doubt = memory.doubt + dt * SLIPPING**2

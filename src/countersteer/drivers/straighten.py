@@ -2,60 +2,65 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Command, Observation
 from countersteer.errors import InputError
+from countersteer.estimation.wall_angle import WallAngle, wall_angle
 
 SPEED = 1.5  # m/s, unless another is asked for
+DOUBT = math.radians(0.5)  # of the angle between two corridors
 
 
 class Memory(NamedTuple):
     """Where the car is in its corridor."""
 
     offset: Scalar  # left of the middle, m
+    error: Scalar  # angle to the corridor, positive to the left, rad
     integral: Scalar  # of the offset, m s
-    bearing: Scalar  # heading of the corridor, rad
+    heading: Scalar  # the estimate's, rad
     time: Scalar
+    walls: Any  # the filter's; () without
 
 
 @pytree
 class Straighten:
     """PID between walls, and a speed held by the throttle.
 
-    steering = -(p offset + i integral + d heading error), the heading error standing for the
-    offset's rate. The offset comes from the side sonars, each by itself while it sees a wall of
-    the corridor, and runs on by heading and speed in between.
+    steering = -(p offset + i integral + d angle), the angle to the corridor standing for the
+    offset's rate. Offset and angle are those of the wall filter (`by` "filter"); or, as the paper
+    had it (`by` "sonar"), the offset comes from the side sonars, each by itself while it sees a
+    wall of the corridor, and the angle from the gyroscope alone.
     """
 
     speed: Scalar  # m/s
-    width: Scalar  # of the corridor, m
+    walls: WallAngle
     bearing: Scalar  # at the start, rad
-    left_x: Scalar  # mounts of the side sonars, m
-    left_y: Scalar
-    right_x: Scalar
-    right_y: Scalar
     hold: Scalar  # throttle per speed that holds it, s/m
     dead_zone: Scalar
     limit: Scalar  # of steering, rad
-    left: int = dataclasses.field(metadata={"static": True})  # their numbers among the mounts
-    right: int = dataclasses.field(metadata={"static": True})
+    by: str = dataclasses.field(default="filter", metadata={"static": True})
     p: Scalar = 1.2  # rad/m
     i: Scalar = 0.3  # rad/(m s)
     d: Scalar = 0.9  # rad/rad
+    steepest: Scalar = 0.15  # steering that offset and integral ask for at most, rad
     throttle_p: Scalar = 0.25  # s/m
-    blend: Scalar = 0.3  # part of a sonar's news that is believed at once
+    blend: Scalar = 0.3  # part of a sonar's news that is believed at once, by sonar
 
     def reset(self, key: jax.Array) -> Memory:
         """In the middle of the corridor."""
         del key
-        return Memory(0.0, 0.0, self.bearing, 0.0)
+        walls: Any = ()
+        if self.by == "filter":
+            walls = self.walls.initial_memory(heading=self.bearing, dtype=np.float64)
+        return Memory(0.0, 0.0, 0.0, self.bearing, 0.0, walls)
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """Steers to the middle at the speed that was asked for."""
@@ -65,53 +70,71 @@ class Straighten:
     def follow(self, memory: Memory, seen: Observation) -> Memory:
         """The memory with what is new: also while something else steers."""
         dt = seen.time - memory.time
-        error = seen.estimate.heading - memory.bearing
-        sideways = seen.estimate.vx * jnp.sin(error) + seen.estimate.vy * jnp.cos(error)
-        offset = memory.offset + dt * sideways
-        for index, side, x, y in (
-            (self.left, 1.0, self.left_x, self.left_y),
-            (self.right, -1.0, self.right_x, self.right_y),
-        ):
-            heard = seen.sonar[index]
-            at = side * (self.width / 2 - heard.value) - x * jnp.sin(error) - y * jnp.cos(error)
+        walls: Any = ()
+        if self.by == "filter":
+            ages = tuple(heard.age for heard in seen.sonar)
+            walls = self.walls.update(memory.walls, seen.sonar, ages, seen.estimate, seen.time)
+            offset, error = walls.offset, walls.angle
+        else:
+            error = memory.error + seen.estimate.heading - memory.heading
+            offset = self._heard(memory.offset, error, seen, dt)
+        return Memory(
+            offset,
+            error,
+            jnp.clip(memory.integral + dt * offset, -0.1, 0.1),
+            seen.estimate.heading,
+            seen.time,
+            walls,
+        )
+
+    def _heard(self, offset: Scalar, error: Scalar, seen: Observation, dt: Scalar) -> Scalar:
+        """The offset by sonar, without a filter."""
+        sine, cosine = jnp.sin(error), jnp.cos(error)
+        offset = offset + dt * (seen.estimate.vx * sine + seen.estimate.vy * cosine)
+        own = self.walls
+        for mount, side, x, y in zip(own.mounts, own.sides, own.xs, own.ys, strict=True):
+            heard = seen.sonar[mount]
+            at = side * (own.width / 2 - heard.value) - x * sine - y * cosine
             # Not a wall of this corridor, or one seen at a slant: a gap, or a turn under way.
-            sees = (jnp.abs(at) < self.width / 2) & (jnp.abs(error) < math.radians(30))
+            sees = (jnp.abs(at) < own.width / 2) & (jnp.abs(error) < math.radians(30))
             news = (heard.age <= dt + 1e-9) & sees
             offset = offset + jnp.where(news, self.blend * (at - offset), 0.0)
-        return memory._replace(
-            offset=offset,
-            integral=jnp.clip(memory.integral + dt * offset, -0.1, 0.1),
-            time=seen.time,
+        return offset
+
+    def turned(self, memory: Memory, angle: Scalar, now: Scalar) -> Memory:
+        """Where `now`: in the corridor behind a corner, of whose middle nothing is known."""
+        walls = memory.walls
+        if self.by == "filter":
+            walls = self.walls.turned(walls, angle, DOUBT)
+        beyond = memory._replace(
+            offset=0.0 * memory.offset, error=memory.error - angle, integral=0.0, walls=walls
         )
+        return jax.tree.map(lambda new, old: jnp.where(now, new, old), beyond, memory)
 
     def command(self, memory: Memory, seen: Observation, speed: Scalar) -> Command:
         """PID, and the throttle that holds a speed."""
-        error = seen.estimate.heading - memory.bearing
-        steering = -(self.p * memory.offset + self.i * memory.integral + self.d * error)
+        aside = self.p * memory.offset + self.i * memory.integral
+        steering = -(jnp.clip(aside, -self.steepest, self.steepest) + self.d * memory.error)
         asked = self.hold * speed + self.throttle_p * (speed - seen.estimate.vx)
         # Braking would reverse a car that stands; let it roll instead.
         throttle = jnp.clip(asked, 0.0, 1.0) + self.dead_zone * jnp.where(asked > 0, 1.0, 0.0)
         return Command(jnp.clip(throttle, 0.0, 1.0), jnp.clip(steering, -self.limit, self.limit))
 
 
-def straighten(course: Course, car: Car, speed: float | None = None) -> Straighten:
+def straighten(
+    course: Course, car: Car, speed: float | None = None, by: str = "filter"
+) -> Straighten:
     """For a course and a nominal car; `speed` in m/s."""
     speed = SPEED if speed is None else speed
-    left, right = mount_number(car, "left"), mount_number(car, "right")
-    mounts = car.sensors.sonar.mounts
+    mount_number(car, "left"), mount_number(car, "right")
     return Straighten(
         speed=speed,
-        width=course.width or 1.0,
+        walls=wall_angle(car, course.width or 1.0),
         bearing=course.start[2],
-        left_x=mounts[left].x,
-        left_y=mounts[left].y,
-        right_x=mounts[right].x,
-        right_y=mounts[right].y,
         hold=holding_throttle(car, speed) / max(speed, 0.1),
         dead_zone=car.motor.dead_zone,
         limit=min(float(car.servo.limit_left), float(car.servo.limit_right)),
-        left=left,
-        right=right,
+        by=by,
     )
 
 

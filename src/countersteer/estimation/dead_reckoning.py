@@ -25,7 +25,8 @@ class Memory(NamedTuple):
 
 def initial_memory(pose: tuple[float, float, float], dtype: np.dtype) -> Memory:
     """At rest at a known pose."""
-    estimate = Estimate(*(jnp.asarray(value, dtype) for value in (*pose, 0.0, 0.0, 0.0)))
+    x, y, heading, zero = (jnp.asarray(value, dtype) for value in (*pose, 0.0))
+    estimate = Estimate(x, y, heading, zero, zero, zero)
     none = np.int32(0)
     return Memory(estimate, none, none, none)
 

@@ -79,3 +79,16 @@ def correct(
         ),
         taken,
     )
+
+
+def renewed(covariance: Covariance, state: int, variance: Scalar, now: Scalar) -> Covariance:
+    """With one state forgotten where `now`: of this variance, and independent of the others."""
+    return tuple(
+        tuple(
+            jnp.where(now, variance if i == j == state else 0.0, value)
+            if state in (i, j)
+            else value
+            for j, value in enumerate(row, start=i)
+        )
+        for i, row in enumerate(covariance)
+    )

@@ -1,43 +1,52 @@
 """The car's velocity: an extended Kalman filter over what gyroscope, accelerometer and encoder say.
 
-Between two steps the accelerometer carries the velocity on: it feels whatever the tyres do, so a
-drift needs no tyre model. Its bias would let sideways speed run away within seconds; while the
-tyres hold, the rear axle hardly moves sideways and the encoder's wheel rolls, and both say so.
+From one reading of the accelerometer to the next, that carries the velocity on: it feels whatever
+the tyres do, so a drift needs no tyre model. Its bias would let sideways speed run away within
+seconds; while the tyres hold, the rear axle hardly moves sideways and the encoder's wheel rolls,
+and both say so. Between readings, and where a sensor has died or is stuck, the nominal car's single
+track goes on. Friction is felt where the rear axle slides, the battery under the motor's current.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import GRAVITY, Car
 from countersteer.car.parameter import Scalar
-from countersteer.estimation import kalman
+from countersteer.estimation import battery, kalman, single_track
+from countersteer.estimation.battery import Pack
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.kalman import Covariance, correct, entry, predict
+from countersteer.estimation.single_track import Actuators
 from countersteer.sensing.suite import Reading, Readings
+from countersteer.world import motor
 from countersteer.world.angle import cosine_sine
-from countersteer.world.chassis import Symmetric
-from countersteer.world.planar import Command
+from countersteer.world.chassis import Symmetric, Vector
+from countersteer.world.planar import Command, rotated
 
 # What the nominal car's declaration does not tell: how far the real one may be from it.
 GYRO_BIAS = 0.01  # rad/s, standard deviation
 ACCEL_BIAS = 0.1  # m/s²
-WANDER = 0.003  # of the gyroscope's bias, rad/s per root second
+WANDER = 0.001  # of the gyroscope's bias, rad/s per root second
 START = 0.02  # heading at the start, rad
-YAW_JERK = 2.0  # by which the yaw rate changes, rad/s per root second
-HOLDS = 0.02  # m/s: how well a wheel that holds is known to roll, and an axle not to slide
+JERK = 1.5  # by which the yaw rate changes, rad/s per root second
+HOLDS = 0.013  # m/s: how well a wheel that holds is known to roll, and an axle not to slide
 MEMORY = 0.2  # s for which that error stays the same
 SLIDES = 1.5  # m/s: the same where the axle slides
 ADHERES = 0.12  # rad of slip angle up to which an axle holds
 USED = 0.6  # part of the nominal friction up to which it does
 SMOOTH = 0.03  # s over which accelerations are looked at
-STALE = 0.05  # s after which a reading tells nothing
+LATE = 2.5  # periods of a sensor after which its last reading tells nothing
 REPEATS = 20  # equal readings after which a sensor counts as stuck
-BLIND = 3.0  # m/s² by which a car accelerates that nothing measures
-FRICTION = 0.1  # standard deviation of the friction scale at the start
+BLIND = 2.0  # m/s²: error of the single track's acceleration
+BLIND_RATE = 1.0  # rad/s: of its yaw rate
+FRICTION = 0.1  # deviation of the friction scale at the start
+FELT = 0.09  # of a moment's friction
 FORGETS = 0.05  # of the friction scale, per root second
 GATE = 4.0  # standard deviations beyond which a reading is not believed
+GYRO_GATE = 6.0  # the same of the gyroscope: a yaw rate changes by jerks
 
 VX, VY, RATE, HEADING, GYRO, AX, AY, ROLLED = range(8)
 
@@ -51,79 +60,148 @@ class Sense(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """The filter between two steps."""
+    """The filter between two steps.
+
+    Yaw rate and heading are those of `tick`; velocity, biases of the accelerometer and `rolled`
+    those of `settled`, and `ahead` goes on from there.
+    """
 
     mean: tuple[Scalar, ...]  # vx, vy, yaw rate, heading, biases (gyro, accel x, y), rolled
     covariance: Covariance
+    tick: Scalar
+    settled: Scalar  # tick of the accelerometer's last reading
+    settled_heading: Scalar
+    ahead: Vector  # velocity at `tick`
     x: Scalar
     y: Scalar
-    friction: Scalar
-    friction_variance: Scalar
     accel_x: Scalar  # smoothed, m/s²
     accel_y: Scalar
     yaw_acceleration: Scalar
-    tick: Scalar
+    friction: Scalar  # of the rear axle, over the nominal
+    friction_variance: Scalar
+    pack: Pack
+    actuators: Actuators
     gyroscope: Sense
     accelerometer: Sense
     encoder: Sense
+    voltmeter: Sense
     lost: Scalar  # reports of the encoder in a row that were not believed
 
 
 def initial_memory(car: Car, pose: tuple[float, float, float], dtype: np.dtype) -> Memory:
-    """At rest at a known pose."""
+    """At rest at a known pose, for the nominal car."""
     gyro, accel = car.sensors.gyroscope, car.sensors.accelerometer
-    x, y, heading = pose
-    zero, none = dtype.type(0), np.int32(0)
-    mean = (0, 0, 0, heading, gyro.bias, accel.bias_x, accel.bias_y, 0)
+    x, y, heading = (jnp.asarray(value, dtype) for value in pose)
+    zero, one, none = dtype.type(0), dtype.type(1), np.int32(0)
     spread = (0.1, 0.05, 0.05, START, GYRO_BIAS, ACCEL_BIAS, ACCEL_BIAS, 0.01)
     quiet = Sense(zero, none, none)
-    return Memory(
-        tuple(jnp.asarray(value, dtype) for value in mean),
-        kalman.diagonal([dtype.type(s) for s in spread]),
-        jnp.asarray(x, dtype),
-        jnp.asarray(y, dtype),
-        dtype.type(1),
-        dtype.type(FRICTION**2),
-        zero,
-        zero,
-        zero,
-        none,
-        quiet,
-        quiet,
-        quiet,
-        none,
+    memory = Memory(
+        (zero, zero, zero, heading, gyro.bias, accel.bias_x, accel.bias_y, zero),
+        kalman.diagonal([one * s for s in spread]),
+        tick=none,
+        settled=none,
+        settled_heading=heading,
+        ahead=Vector(zero, zero, zero),
+        x=x,
+        y=y,
+        accel_x=zero,
+        accel_y=zero,
+        yaw_acceleration=zero,
+        friction=one,
+        friction_variance=one * FRICTION**2,
+        pack=battery.initial(car),
+        actuators=Actuators(zero, zero),
+        gyroscope=quiet,
+        accelerometer=quiet,
+        encoder=quiet,
+        voltmeter=quiet,
+        lost=none,
     )
+    return typed(memory, dtype)
 
 
-def heard(sense: Sense, reading: Reading, tick: Scalar, dt: float) -> tuple[Sense, Scalar, Scalar]:
-    """A sensor with what it last said, whether that is new, and whether it is to be believed."""
+def typed(memory: Memory, dtype: np.dtype) -> Memory:
+    """Every number that is not a count in the precision of the car."""
+
+    def leaf(value: Scalar) -> Scalar:
+        whole = jnp.issubdtype(jnp.result_type(value), jnp.integer)
+        return jnp.asarray(value, np.int32 if whole else dtype)
+
+    typed: Memory = jax.tree.map(leaf, memory)
+    return typed
+
+
+def heard(
+    sense: Sense, reading: Reading, rate: Scalar, tick: Scalar, dt: float
+) -> tuple[Sense, Scalar, Scalar]:
+    """A sensor with what it last said, whether that is new, and whether it is to be believed.
+
+    It is not where it is late by more than its rate allows, stuck, or no number.
+    """
     fresh = reading.tick > sense.tick
     same = reading.value == sense.value
     repeats = jnp.where(fresh, jnp.where(same, sense.repeats + 1, 0), sense.repeats)
-    sound = ((tick - reading.tick) * dt < STALE) & (reading.tick > 0) & (repeats < REPEATS)
-    sound = sound & jnp.isfinite(reading.value)
+    timely = (tick - reading.tick) * dt * rate < LATE
+    sound = timely & (reading.tick > 0) & (repeats < REPEATS) & jnp.isfinite(reading.value)
     return Sense(reading.value, jnp.maximum(reading.tick, sense.tick), repeats), fresh, sound
 
 
 def update(
     car: Car, memory: Memory, readings: Readings, command: Command, tick: Scalar, dt: float
 ) -> Memory:
-    """One step of the filter to `tick`, for the nominal car. The first one is at tick 0."""
+    """The filter at `tick`, with what the readings have that is new, for the nominal car.
+
+    `command` is what the driver asked for since the step before.
+    """
     sensors, body = car.sensors, car.body
     mean, covariance = memory.mean, memory.covariance
-    dtype = jnp.result_type(mean[0])
-    h = ((tick - memory.tick) * dt).astype(dtype)
-    blend = -jnp.expm1(-h / SMOOTH)
+    dtype = jnp.result_type(mean[VX])
+    gyro, accel = sensors.gyroscope, sensors.accelerometer
+    gyroscope, turned, gyro_sound = heard(memory.gyroscope, readings.gyroscope, gyro.rate, tick, dt)
+    accelerometer, weighed, accel_sound = heard(
+        memory.accelerometer, readings.accel_x, accel.rate, tick, dt
+    )
+    encoder, counted, _ = heard(
+        memory.encoder, readings.counts, 1 / sensors.encoder.update, tick, dt
+    )
+    voltmeter, probed, _ = heard(
+        memory.voltmeter, readings.battery, sensors.voltmeter.rate, tick, dt
+    )
     behind = body.wheelbase - body.front_axle
-    gyroscope, turned, gyro_sound = heard(memory.gyroscope, readings.gyroscope, tick, dt)
-    accelerometer, _, accel_sound = heard(memory.accelerometer, readings.accel_x, tick, dt)
-    accel_sound = accel_sound & jnp.isfinite(readings.accel_y.value)
-    encoder, counted, _ = heard(memory.encoder, readings.counts, tick, dt)
+    seconds = lambda ticks: (ticks * dt).astype(dtype)  # noqa: E731  # used five times
 
-    # The yaw rate, by the gyroscope.
-    rate_before = mean[RATE]
-    covariance = predict(covariance, {}, {RATE: YAW_JERK**2 * h, GYRO: WANDER**2 * h})
-    gyro = sensors.gyroscope
+    # What the single track makes of the command.
+    h = seconds(tick - memory.tick)
+    actuators = single_track.follow(car, memory.actuators, command, h)
+    slip_speed = memory.ahead.y - behind * memory.ahead.yaw
+    slip = jnp.abs(slip_speed) / (jnp.abs(memory.ahead.x) + 0.3)
+    rolls = slip < ADHERES
+    rim = jnp.where(rolls, memory.ahead.x, readings.wheel_speed.value)
+    drive = motor.drive(
+        car.motor,
+        car.drivetrain,
+        battery.as_believed(car, memory.pack),
+        actuators.duty,
+        1.0,
+        rim / car.tires.rear.radius,
+    )
+    guess = single_track.step(car, memory.ahead, actuators, drive, memory.friction, h)
+    # Between two readings the last one is held: the better guess, as measured.
+    held = rotated(memory.ahead, h * memory.ahead.yaw)
+    ahead = Vector(
+        jnp.where(accel_sound, held.x + h * memory.accel_x, guess.x),
+        jnp.where(accel_sound, held.y + h * memory.accel_y, guess.y),
+        jnp.where(gyro_sound, held.yaw, guess.yaw),
+    )
+    believed = battery.update(
+        car, memory.pack, readings.battery.value, drive.battery_current, probed, h
+    )
+
+    # Yaw rate and heading.
+    restless = jnp.where(entry(covariance, RATE, RATE) < BLIND_RATE**2, JERK**2 * h, 0.0)
+    covariance = predict(covariance, {HEADING: {RATE: h}}, {RATE: restless, GYRO: WANDER**2 * h})
+    heading = mean[HEADING] + h * (memory.ahead.yaw + ahead.yaw) / 2
+    mean = (*mean[:RATE], ahead.yaw, heading, *mean[GYRO:])
     saturated = jnp.abs(gyroscope.value) > 0.99 * gyro.reach
     mean, covariance, _ = correct(
         mean,
@@ -132,135 +210,171 @@ def update(
         gyroscope.value - mean[RATE] - mean[GYRO],
         gyro.noise**2 + gyro.resolution**2 / 12 + 1e-8 + jnp.where(saturated, 0.1, 0.0),
         turned & gyro_sound,
-        GATE,
+        GYRO_GATE,
     )
-
-    # Velocity and heading, carried on.
-    vx, vy, rate, heading, _, bias_x, bias_y, rolled = mean
-    part = sensors.accelerometer
-    reach = 0.99 * part.reach
-    hit = (jnp.abs(readings.accel_x.value) > reach) | (jnp.abs(readings.accel_y.value) > reach)
-    # What is not measured: a velocity that stays as it is.
-    forward = jnp.where(accel_sound, readings.accel_x.value - bias_x, -rate * vy)
-    left = jnp.where(accel_sound, readings.accel_y.value - bias_y, rate * vx)
-    measured = jnp.where(accel_sound, 1.0, 0.0)
-    shaken = part.noise**2 + part.resolution**2 / 12
-    shaken = jnp.where(accel_sound, shaken * h**2, BLIND**2 * h * SMOOTH)
-    shaken = shaken + jnp.where(hit, 1.0, 0.0)
-    accel_x = memory.accel_x + blend * (forward - memory.accel_x)
-    accel_y = memory.accel_y + blend * (left - memory.accel_y)
-    turning = (rate - rate_before) / jnp.maximum(h, 1e-6)
+    rate = mean[RATE]
+    # The single track erred by this at the end, so by half of it on the way.
+    since = jnp.where(turned, seconds(gyroscope.tick - memory.gyroscope.tick), 0.0)
+    heading = mean[HEADING] + jnp.minimum(since, 0.2) * (rate - ahead.yaw) / 2
+    turning = (rate - memory.ahead.yaw) / jnp.maximum(h, 1e-6)
+    blend = -jnp.expm1(-h / SMOOTH)
     yaw_acceleration = memory.yaw_acceleration + blend * (turning - memory.yaw_acceleration)
 
-    # How hard the axles work, and whether the rear one slides.
+    # The velocity goes on to the accelerometer's reading; without one, as the single track does.
+    measured = weighed & accel_sound & jnp.isfinite(readings.accel_y.value)
+    blind = ~measured & (seconds(tick - memory.settled) * accel.rate > LATE)
+    settled = jnp.where(measured, accelerometer.tick, jnp.where(blind, tick, memory.settled))
+    h_settled = seconds(settled - memory.settled)
+    per = 1 / jnp.maximum(h_settled, 1e-6)
+    vx, vy, _, _, _, bias_x, bias_y, rolled = mean
+    turn = jnp.where(h_settled > 0, heading - memory.settled_heading, 0.0)
+    forward = jnp.where(measured, readings.accel_x.value - bias_x, (ahead.x - vx) * per - rate * vy)
+    left = jnp.where(measured, readings.accel_y.value - bias_y, (ahead.y - vy) * per + rate * vx)
+    reach = 0.99 * accel.reach
+    hit = (jnp.abs(readings.accel_x.value) > reach) | (jnp.abs(readings.accel_y.value) > reach)
+    shaken = (accel.noise**2 + accel.resolution**2 / 12) * h_settled**2 + jnp.where(hit, 1.0, 0.0)
+    shaken = jnp.where(measured, shaken, BLIND**2 * SMOOTH * h_settled)
+    blend = -jnp.expm1(-h_settled / SMOOTH)
+    accel_x = memory.accel_x + blend * (forward - memory.accel_x)
+    accel_y = memory.accel_y + blend * (left - memory.accel_y)
+
+    # How hard the axles work, and whether they hold.
     lever = body.yaw_inertia * yaw_acceleration / body.mass
-    rear_load = body.front_axle / body.wheelbase  # part of the weight
-    rear_pull = (accel_y * body.front_axle - lever) / (body.wheelbase * rear_load * GRAVITY)
-    slip_speed = vy - behind * rate
-    slip = jnp.abs(slip_speed) / (jnp.abs(vx) + 0.3)
+    rear_load = (body.front_axle * GRAVITY + body.cm_height * accel_x) / body.wheelbase
+    rear_pull = (accel_y * body.front_axle - lever) / (body.wheelbase * rear_load)
     grip = jnp.minimum(car.tires.rear.peak_friction, car.tires.front.peak_friction)
     used = jnp.sqrt(accel_x**2 + accel_y**2) / (GRAVITY * grip)
-    holds = (slip < ADHERES) & (used < USED)
+    holds = rolls & (used < USED)
 
     # The encoder's wheel: `rolled` is what it has rolled since the regions counted so far.
     side = {"rear-left": 1.0, "front-left": 1.0, "rear-right": -1.0, "front-right": -1.0}
     arm = side.get(sensors.encoder.on, 0.0) * body.track / 2
     tire = car.tires.rear if "rear" in sensors.encoder.on else car.tires.front
-    stretch = 1 + accel_x / (GRAVITY * tire.longitudinal_stiffness)
-    turn = h * (rate + rate_before) / 2
-    known = jnp.where(holds, HOLDS, SLIDES) ** 2 * 2 * MEMORY * h
+    stretch = 1 + accel_x / (GRAVITY * car.tires.rear.longitudinal_stiffness)
+    known = jnp.where(holds, HOLDS, SLIDES) ** 2 * 2 * MEMORY * h_settled
+    in_play = jnp.where(measured, h_settled, 0.0)
     covariance = predict(
         covariance,
         {
-            VX: {VY: turn, RATE: h * vy, AX: -h * measured},
-            VY: {VX: -turn, RATE: -h * vx, AY: -h * measured},
-            HEADING: {RATE: h},
-            ROLLED: {VX: h * stretch, RATE: -h * arm},
+            VX: {VY: turn, RATE: h_settled * vy, AX: -in_play},
+            VY: {VX: -turn, RATE: -h_settled * vx, AY: -in_play},
+            ROLLED: {VX: h_settled * stretch, RATE: -h_settled * arm},
         },
         {VX: shaken, VY: shaken, ROLLED: known},
     )
-    cosine, sine = cosine_sine(turn / 2)
-    # Half the turn before the push and half after it: the velocity's length is kept.
-    vx, vy = cosine * vx + sine * vy + h * forward, cosine * vy - sine * vx + h * left
-    vx, vy = cosine * vx + sine * vy, cosine * vy - sine * vx
-    heading = heading + turn
-    rolled = rolled + h * (stretch * vx - arm * rate)
-    mean = (vx, vy, rate, heading, *mean[4:7], rolled)
+    # Half the turn before the push and half after it: a free velocity keeps its length.
+    halfway = rotated(Vector(vx, vy, rate), turn / 2)
+    after = rotated(
+        Vector(halfway.x + h_settled * forward, halfway.y + h_settled * left, rate), turn / 2
+    )
+    rolled = rolled + h_settled * (stretch * (vx + after.x) / 2 - arm * rate)
 
-    # The regions that were counted since: what is left of `rolled` is within one of them.
+    # The regions counted since: what is left of `rolled` is within one of them.
     region = jnp.pi * tire.radius / sensors.encoder.regions
     passed = jnp.where(counted, encoder.value - memory.encoder.value, 0.0)
-    backwards = jnp.where(vx < 0, -1.0, 1.0)
-    mean = (*mean[:ROLLED], mean[ROLLED] - backwards * passed * region)
-    # A standing disc says nothing of which way it was coming.
+    backwards = jnp.where(after.x < 0, -1.0, 1.0)
+    late = jnp.where(counted, seconds(settled - encoder.tick), 0.0)
+    rolled = rolled - backwards * passed * region
+    mean = (after.x, after.y, rate, heading, mean[GYRO], bias_x, bias_y, rolled)
     mean, covariance, taken = correct(
         mean,
         covariance,
-        {ROLLED: 1.0},
-        backwards * region / 2 - mean[ROLLED],
+        {ROLLED: 1.0, VX: -late},
+        backwards * region / 2 - (rolled - late * after.x),
         region**2 / 12,
         counted,
         GATE,
     )
-    # A wheel that slid or a lost report: begin anew within the region.
+    # After a slide or a lost report it begins anew within its region.
     failed = counted & ~taken
     mean = (*mean[:ROLLED], jnp.where(failed, backwards * region / 2, mean[ROLLED]))
-    fresh_start = region**2 / 12
-    covariance = tuple(
-        tuple(
-            jnp.where(failed, fresh_start if i == ROLLED else 0.0, value)
-            if i + j == ROLLED
-            else value
-            for j, value in enumerate(row)
-        )
-        for i, row in enumerate(covariance)
-    )
+    covariance = kalman.renewed(covariance, ROLLED, region**2 / 12, failed)
     lost = jnp.where(counted, jnp.where(taken | (passed == 0), 0, memory.lost + 1), memory.lost)
 
-    # The rear axle's tread drifts sideways by the slip angle that its pull takes.
-    creep = -jnp.abs(vx) * rear_pull / car.tires.rear.cornering_stiffness
+    # The rear axle's tread creeps sideways by the slip angle that its pull takes.
+    creep = -jnp.abs(mean[VX]) * rear_pull / car.tires.rear.cornering_stiffness
     mean, covariance, _ = correct(
         mean,
         covariance,
         {VY: 1.0, RATE: -behind},
         creep - (mean[VY] - behind * mean[RATE]),
-        ((HOLDS + 0.5 * jnp.abs(creep)) ** 2) * 2 * MEMORY / jnp.maximum(h, 1e-6),
-        holds & (h > 0),
+        (HOLDS + 0.5 * jnp.abs(creep)) ** 2 * 2 * MEMORY * per,
+        holds & (h_settled > 0),
         GATE,
     )
 
+    # Where the rear axle slides, its pull is its friction, against the slip.
+    slip_y = mean[VY] - behind * mean[RATE]
+    slip_x = mean[VX] - readings.wheel_speed.value
+    rear = car.tires.rear
+    against = -slip_y / jnp.sqrt(slip_x**2 + slip_y**2 + 1e-6)
+    full = rear.sliding_ratio * rear.friction * against
+    sliding = rear.cornering_stiffness * jnp.abs(slip_y) > 4 * rear.friction * memory.friction * (
+        jnp.abs(readings.wheel_speed.value) + 0.1
+    )
+    (friction,), ((friction_variance,),), _ = correct(
+        (memory.friction,),
+        predict(((memory.friction_variance,),), {}, {0: FORGETS**2 * h_settled}),
+        {0: full},
+        rear_pull - full * memory.friction,
+        (FELT * rear.friction) ** 2 * 2 * MEMORY * per,
+        sliding & measured & (jnp.abs(against) > 0.5),
+        GATE,
+    )
+
+    stands = h_settled > 0
+    ahead = Vector(
+        jnp.where(stands, mean[VX], ahead.x), jnp.where(stands, mean[VY], ahead.y), mean[RATE]
+    )
     cosine, sine = cosine_sine(mean[HEADING])
-    return memory._replace(
-        mean=mean,
-        covariance=covariance,
-        x=memory.x + h * (cosine * mean[VX] - sine * mean[VY]),
-        y=memory.y + h * (sine * mean[VX] + cosine * mean[VY]),
-        accel_x=accel_x,
-        accel_y=accel_y,
-        yaw_acceleration=yaw_acceleration,
-        tick=tick,
-        gyroscope=gyroscope,
-        accelerometer=accelerometer,
-        encoder=encoder,
-        lost=lost,
+    return typed(
+        Memory(
+            mean,
+            covariance,
+            tick,
+            settled,
+            jnp.where(stands, mean[HEADING], memory.settled_heading),
+            ahead,
+            memory.x + h * (cosine * ahead.x - sine * ahead.y),
+            memory.y + h * (sine * ahead.x + cosine * ahead.y),
+            accel_x,
+            accel_y,
+            yaw_acceleration,
+            jnp.clip(friction, 0.2, 3.0),
+            friction_variance,
+            believed,
+            actuators,
+            gyroscope,
+            accelerometer,
+            encoder,
+            voltmeter,
+            lost,
+        ),
+        dtype,
     )
 
 
-def estimate(memory: Memory) -> Estimate:
+def estimate(car: Car, memory: Memory, dt: float) -> Estimate:
     """What the filter believes."""
-    vx, vy, rate, heading, gyro_bias, *_ = memory.mean
-    p = memory.covariance
+    mean, p = memory.mean, memory.covariance
+    dtype = jnp.result_type(mean[VX])
+    astray = BLIND**2 * SMOOTH * ((memory.tick - memory.settled) * dt).astype(dtype)
+    voltage, resistance = memory.pack.mean
     return Estimate(
         memory.x,
         memory.y,
-        heading,
-        vx,
-        vy,
-        rate,
-        gyro_bias,
-        velocity_covariance=Symmetric(
-            entry(p, VX, VX),
-            entry(p, VY, VY),
+        mean[HEADING],
+        memory.ahead.x,
+        memory.ahead.y,
+        memory.ahead.yaw,
+        mean[GYRO],
+        memory.friction,
+        jnp.sqrt(memory.friction_variance),
+        voltage / car.battery.full,
+        resistance,
+        Symmetric(
+            entry(p, VX, VX) + astray,
+            entry(p, VY, VY) + astray,
             entry(p, RATE, RATE),
             entry(p, VX, VY),
             entry(p, VX, RATE),

@@ -1,0 +1,68 @@
+"""The nominal car as a single track: what it does where no sensor tells."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from countersteer.car.car import GRAVITY, Car
+from countersteer.car.parameter import Scalar
+from countersteer.world import drivetrain, motor, servo, tyre
+from countersteer.world.angle import cosine_sine
+from countersteer.world.chassis import Symmetric, Vector, combine, dot, solve
+from countersteer.world.planar import Command, rotated
+
+
+class Actuators(NamedTuple):
+    """What the commands so far have made of motor and servo."""
+
+    duty: Scalar
+    steering: Scalar  # rad
+
+
+def follow(car: Car, before: Actuators, command: Command, h: Scalar) -> Actuators:
+    """After h seconds of a command; a pure delay counts as one lag more."""
+    goal = motor.duty(car.motor, command.throttle)
+    slow = dataclasses.replace(car.servo, lag=car.servo.lag + car.servo.delay)
+    return Actuators(
+        before.duty - (goal - before.duty) * jnp.expm1(-h / (car.motor.lag + car.motor.delay)),
+        servo.turn(slow, before.steering, servo.target(slow, command.steering), h),
+    )
+
+
+def step(
+    car: Car, velocity: Vector, before: Actuators, drive: motor.Drive, friction: Scalar, h: Scalar
+) -> Vector:
+    """The velocity h seconds later, in the axes of then, by one implicit Euler step.
+
+    Two wheels at their static loads, by their tyres' law. The rear one rolls; the front one rolls
+    too, or turns as fast as the rear one by as much as the centre is locked. The motor's torque
+    pulls up to what the tyres hold. `friction` scales the tyres' friction.
+    """
+    body, line = car.body, car.drivetrain
+    matrix = Symmetric(body.mass, body.mass, body.yaw_inertia, 0.0, 0.0, 0.0)
+    momentum = Vector(
+        body.mass * velocity.x, body.mass * velocity.y, body.yaw_inertia * velocity.yaw
+    )
+    behind = body.wheelbase - body.front_axle
+    dragged: Scalar = 0.0  # what the locked centre takes from the front wheel, for the rear one
+    for tire, arm, other, share, (cosine, sine) in (
+        (car.tires.front, body.front_axle, behind, line.front_share, cosine_sine(before.steering)),
+        (car.tires.rear, -behind, body.front_axle, 1 - line.front_share, (1.0, 0.0)),
+    ):
+        roll = Vector(cosine, sine, arm * sine)
+        slide = Vector(-sine, cosine, arm * cosine)
+        load = body.mass * GRAVITY * other / body.wheelbase
+        along = dot(roll, velocity)
+        rim = along + line.center_lock * (velocity.x - along)
+        scaled = dataclasses.replace(tire, friction=friction * tire.friction)
+        contact = tyre.contact(scaled, load, along - rim, dot(slide, velocity), rim)
+        pull = share * drive.torque / tire.radius - dragged
+        dragged = contact.k_x * (rim - along)
+        slope = (share * drive.slope + 2 * drivetrain.drag(car, rim / tire.radius)) / tire.radius**2
+        # Beyond what the tyre holds the wheel spins or locks.
+        most = friction * tyre.limit(tire, load)
+        over = jnp.minimum(1.0, most / (jnp.abs(pull - slope * along) + 1e-6))
+        matrix = matrix.plus(h * contact.k_y, slide).plus(h * over * slope, roll)
+        momentum = combine(1.0, momentum, h * (over * pull + dragged), roll)
+    return rotated(solve(matrix, momentum), h * velocity.yaw)

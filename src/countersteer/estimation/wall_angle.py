@@ -1,0 +1,167 @@
+"""Where the car is in its corridor, and at which angle: a Kalman filter on the side sonars.
+
+The states are the offset from the corridor's middle (m, to the left), the angle of the car to it
+(rad, to the left) and the gyroscope's bias. Speed and gyroscope carry them on, and so the response
+to what is steered; each side sonar tells how far its wall is. Seen over a distance driven, these
+tell the angle too, which neither sonar measures: what the heading's slow drift leaves out.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.car.parameter import Scalar, pytree
+from countersteer.estimation.estimate import Estimate
+from countersteer.estimation.kalman import Covariance, correct, diagonal, entry, predict
+from countersteer.sensing.suite import Reading
+
+OFFSET, ANGLE, BIAS = range(3)
+START = (0.1, 0.05, 0.005)  # standard deviations at the start: m, rad, rad/s
+WALKS = (0.02, 0.02, 0.0005)  # growth of them, per root second
+STEEPEST = math.radians(30)  # angle to a wall beyond which it is not looked at
+GATE = 3.5  # standard deviations beyond which a reading is of something else than the wall
+FORGETS = 0.5  # s without a believed reading from which the offset is known less and less
+CURVES = 0.03  # rad/m: deviation of the walls' bend in what the rooms call a straight
+
+
+class Memory(NamedTuple):
+    """The filter between two steps."""
+
+    mean: tuple[Scalar, ...]
+    covariance: Covariance
+    time: Scalar
+    heading: Scalar  # the velocity filter's, at that time
+    believed: Scalar  # time of the last reading that was believed
+
+    @property
+    def offset(self) -> Scalar:
+        """From the corridor's middle, to the left (m)."""
+        return self.mean[OFFSET]
+
+    @property
+    def angle(self) -> Scalar:
+        """Of the car to the corridor, to the left (rad)."""
+        return self.mean[ANGLE]
+
+    @property
+    def offset_deviation(self) -> Scalar:
+        """Standard deviation of the offset (m)."""
+        return jnp.sqrt(entry(self.covariance, OFFSET, OFFSET))
+
+    @property
+    def angle_deviation(self) -> Scalar:
+        """Standard deviation of the angle (rad)."""
+        return jnp.sqrt(entry(self.covariance, ANGLE, ANGLE))
+
+
+@pytree
+class WallAngle:
+    """The filter for a car's side sonars in a corridor.
+
+    `sides` is 1 for a sonar that looks left, -1 for one that looks right, in the order of `mounts`.
+    """
+
+    width: Scalar  # of the corridor, m
+    xs: tuple[Scalar, ...]  # where the side sonars sit, m
+    ys: tuple[Scalar, ...]
+    noise: Scalar  # of a distance, m
+    resolution: Scalar
+    mounts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
+    sides: tuple[float, ...] = dataclasses.field(metadata={"static": True})
+
+    def initial_memory(
+        self,
+        offset: float = 0.0,
+        angle: float = 0.0,
+        heading: float = 0.0,
+        dtype: type = np.float64,
+    ) -> Memory:
+        """At the start of a straight."""
+        return jax.tree.map(
+            lambda value: jnp.asarray(value, dtype),
+            Memory((offset, angle, 0.0), diagonal(START), 0.0, heading, 0.0),
+        )
+
+    def turned(self, memory: Memory, angle: Scalar, doubt: Scalar) -> Memory:
+        """The corridor beyond a corner of this angle: nothing is known of the offset there."""
+        bias = entry(memory.covariance, BIAS, BIAS)
+        steep = entry(memory.covariance, ANGLE, ANGLE)
+        covariance = diagonal([self.width / 4, jnp.sqrt(steep) + doubt, jnp.sqrt(bias)])
+        mean = (0.0 * angle, memory.angle - angle, memory.mean[BIAS])
+        return memory._replace(mean=mean, covariance=covariance)
+
+    def update(
+        self,
+        memory: Memory,
+        sonar: Sequence[Reading | Any],
+        ages: tuple[Scalar, ...],
+        estimate: Estimate,
+        time: Scalar,
+    ) -> Memory:
+        """With what the sonars have that is new: those readings whose age (s) is under a step's.
+
+        A side's distance d is that to where its beam meets the wall nearest, so that
+        side (w/2 - d) = offset + x sin(angle) + y cos(angle) while the wall is within the cone.
+        """
+        h = time - memory.time
+        turned = estimate.heading - memory.heading
+        offset, angle, bias = memory.mean
+        halfway = angle + (turned - h * bias) / 2
+        cosine, sine = jnp.cos(halfway), jnp.sin(halfway)
+        vx, vy = estimate.vx, estimate.vy
+        mean = (offset + h * (vx * sine + vy * cosine), angle + turned - h * bias, bias)
+        speeds = estimate.velocity_covariance
+        covariance = predict(
+            memory.covariance,
+            {OFFSET: {ANGLE: h * (vx * cosine - vy * sine)}, ANGLE: {BIAS: -h}},
+            {
+                OFFSET: WALKS[0] ** 2 * h + 0.2 * h * (speeds.yy + speeds.xx * sine**2),
+                ANGLE: WALKS[1] ** 2 * h + (CURVES * vx * h) ** 2,
+                BIAS: WALKS[2] ** 2 * h,
+            },
+        )
+        believed = memory.believed
+        for mount, side, x, y in zip(self.mounts, self.sides, self.xs, self.ys, strict=True):
+            cosine, sine = jnp.cos(mean[ANGLE]), jnp.sin(mean[ANGLE])
+            seen = side * (self.width / 2 - sonar[mount].value)
+            mean, covariance, taken = correct(
+                mean,
+                covariance,
+                {OFFSET: 1.0, ANGLE: x * cosine - y * sine},
+                seen - (mean[OFFSET] + x * sine + y * cosine),
+                self.noise**2 + self.resolution**2 / 12 + 1e-8,
+                (ages[mount] < h + 1e-9)
+                & jnp.isfinite(sonar[mount].value)
+                & (jnp.abs(mean[ANGLE]) < STEEPEST),
+                GATE,
+            )
+            believed = jnp.where(taken, time, believed)
+        # Long without a believed reading: rather believe too little than shut them all out.
+        lost = jnp.where(time - believed > FORGETS, (0.3 * self.width) ** 2 * h, 0.0)
+        covariance = predict(covariance, {}, {OFFSET: lost})
+        return Memory(mean, covariance, time, estimate.heading, believed)
+
+
+def wall_angle(car: Car, width: float) -> WallAngle:
+    """For the nominal car's sonars that look to a side, within 30° of square."""
+    sonar = car.sensors.sonar
+    found = [
+        (number, math.copysign(1.0, float(mount.angle)), mount)
+        for number, mount in enumerate(sonar.mounts)
+        if abs(abs(float(mount.angle)) - math.pi / 2) < math.radians(30)
+    ]
+    return WallAngle(
+        width=width,
+        xs=tuple(mount.x for _, _, mount in found),
+        ys=tuple(mount.y for _, _, mount in found),
+        noise=sonar.noise,
+        resolution=sonar.resolution,
+        mounts=tuple(number for number, _, _ in found),
+        sides=tuple(side for _, side, _ in found),
+    )
