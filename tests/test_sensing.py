@@ -243,7 +243,7 @@ def listen() -> Callable[..., suite.Readings]:
         )
         key = jax.random.key(seed)
         first = jax.tree.map(lambda leaf: leaf[0], motion)
-        memory = jax.tree.map(jnp.asarray, suite.initial_memory(car, first))
+        memory = jax.tree.map(jnp.asarray, suite.initial_memory(car, first, DT))
         readings = program(car, motion, memory, key, suite.periods(car, DT))
         return jax.tree.map(np.asarray, readings)
 
@@ -455,7 +455,7 @@ def test_the_eye_turns_with_the_car(listen: Callable) -> None:
 def test_without_lines_the_detector_is_not_there(listen: Callable) -> None:
     told = listen(RX7)
     assert told.line_crossings is told.line_speed is None
-    assert suite.initial_memory(RX7, start(RX7, 4).motion).eye is None
+    assert suite.initial_memory(RX7, start(RX7, 4).motion, DT).eye is None
 
 
 @pytest.mark.parametrize("name", ["box", "ess"])

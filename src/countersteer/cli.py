@@ -124,6 +124,14 @@ def parser() -> Parser:
         default="filter",
         help="what the driver knows of its motion (default filter: from the sensors)",
     )
+    drive.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="TEXT",
+        help="a sensor that is dead, stuck or spiking for a while: 'SENSOR KIND START DURATION' in "
+        "seconds, such as 'gyroscope stuck 2.0 0.5' (repeatable)",
+    )
 
     replay = verb("replay", "commands in, motion out; or a log against the simulator", run_replay)
     replay.add_argument(
@@ -286,6 +294,7 @@ def run_drive(options: argparse.Namespace) -> int:
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.link.link import LINKS
+    from countersteer.sensing.faults import read_fault
     from countersteer.simulator import Simulator
 
     course, car = load_course(options.course), load_car(options.car, options.set)
@@ -304,6 +313,7 @@ def run_drive(options: argparse.Namespace) -> int:
         options.dt,
         options.seed,
         options.battery,
+        faults=tuple(read_fault(text) for text in options.fault),
     )
     # A lap at a crawl still ends.
     longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
@@ -318,6 +328,7 @@ def run_replay(options: argparse.Namespace) -> int:
     from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator
+    from countersteer.world.floor import floor_of_run
 
     if options.horizon and not options.compare:
         raise InputError("--horizon is of a comparison: give --compare as well")
@@ -361,6 +372,7 @@ def run_replay(options: argparse.Namespace) -> int:
         start=pose,
         velocity=velocity,
         charge=charge,
+        floor=floor_of_run(run.about) if run else None,
     )
     times = commands["time_s"]
     if times[-1] > LONGEST_REPLAY:

@@ -31,9 +31,11 @@ from countersteer.drivers.driver import Driver, Heard, Observation
 from countersteer.estimation import dead_reckoning
 from countersteer.estimation.dead_reckoning import Estimate
 from countersteer.link.link import ONBOARD, Channel, Link, exchange, initial_channel
-from countersteer.sensing import sonar, suite
+from countersteer.sensing import faults, sonar, suite
+from countersteer.sensing.faults import Fault
 from countersteer.sensing.suite import Reading, Readings
 from countersteer.world import drivetrain, motor, planar
+from countersteer.world.floor import Floor
 from countersteer.world.planar import Command
 from countersteer.world.state import Motion, State
 
@@ -60,6 +62,8 @@ class Surroundings(NamedTuple):
     corners: Array  # (2n, 3), from `sonar.edges`
     key: jax.Array
     loss: Scalar
+    floor: Floor | None = None  # None: the same friction everywhere
+    faults: tuple[Fault, ...] = ()
 
 
 class Loop(NamedTuple):
@@ -73,6 +77,12 @@ class Loop(NamedTuple):
     up: Channel | None
     down: Channel | None
     memory: Any  # the driver's
+    faulty: Readings | None = None  # what failing sensors have reported; None: none ever fails
+
+    @property
+    def readings(self) -> Readings:
+        """The sensors' last reports."""
+        return self.sensors.readings if self.faulty is None else self.faulty
 
 
 class Record(NamedTuple):
@@ -109,6 +119,12 @@ class Simulator:
     charge: float = 1.0
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: tuple[float, float, float] | None = None  # instead of the course's
+    floor: Floor | None = None  # where friction varies from place to place
+    faults: tuple[Fault, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises `InputError` for a fault of a sensor that the car has not."""
+        faults.check(self.faults, self.car)
 
     def plan(self) -> Plan:
         """Periods in whole ticks, at least one each."""
@@ -161,19 +177,24 @@ class Simulator:
         walls = padded(self.course.walls if self.course else np.zeros((0, 4)), dtype)
         key, driver_key = jax.random.split(jax.random.key(self.seed))
         around = Surroundings(walls, sonar.edges(walls), key, dtype.type(self.link.loss))
+        if self.floor is not None or self.faults:
+            cast = partial(jax.tree.map, dtype.type)
+            around = around._replace(floor=cast(self.floor), faults=cast(self.faults))
         state = planar.initial_state(self.car, self.dt, pose, self.velocity, self.charge)
-        sensors = suite.initial_memory(self.car, state.motion)
+        sensors = suite.initial_memory(self.car, state.motion, self.dt)
         zero = dtype.type(0)
         still = Command(zero, zero)
         up = down = None
         if not plan.onboard:
             up = initial_channel(still, plan.control, plan.delay)
             down = initial_channel(sensors.readings, plan.telemetry, plan.delay)
+        faulty = sensors.readings if self.faults else None
         estimate = dead_reckoning.initial_memory(pose, dtype)
         memory = self.driver.reset(driver_key)
         if not jax.tree_util.all_leaves([self.driver]):
             memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
-        return around, Loop(np.int32(0), state, sensors, estimate, still, up, down, memory)
+        loop = Loop(np.int32(0), state, sensors, estimate, still, up, down, memory, faulty)
+        return around, loop
 
     def _stepped(
         self, plan: Plan, ticks: int, around: Surroundings, loop: Loop
@@ -225,7 +246,7 @@ def hold(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loop, 
 
 def observe(plan: Plan, loop: Loop) -> tuple[Loop, Observation]:
     """What the driver is told at this tick: the readings that it has heard, and the estimate."""
-    readings = loop.sensors.readings if loop.down is None else loop.down.latest
+    readings = loop.readings if loop.down is None else loop.down.latest
     memory = dead_reckoning.update(loop.estimate, readings, plan.dt)
     motion = loop.state.motion
     known = memory.estimate
@@ -261,7 +282,7 @@ def advance(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loo
         stops = silent & (up.arrived >= 0) if plan.timeout else jnp.asarray(False)
         command = up.latest._replace(throttle=jnp.where(stops, 0.0, up.latest.throttle))
         fresh = fresh | (stops & (loop.tick - up.arrived == plan.timeout + 1))
-    state = planar.step(car, around.walls, loop.state, command, loop.tick, plan.dt)
+    state = planar.step(car, around.walls, loop.state, command, loop.tick, plan.dt, around.floor)
     after = loop.tick + 1
     sensors = suite.sense(
         car,
@@ -274,8 +295,13 @@ def advance(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loo
         plan.sensors,
         plan.dt,
     )
+    readings, faulty = sensors.readings, loop.faulty
+    if faulty is not None:
+        readings = faulty = faults.report(
+            around.faults, car, faulty, readings, around.key, after, plan.dt
+        )
     if down is not None:
-        down = exchange(down, sensors.readings, lost[1], after, plan.telemetry, plan.delay)
+        down = exchange(down, readings, lost[1], after, plan.telemetry, plan.delay)
     before = loop.state.motion
     record = Record(
         loop.tick,
@@ -283,13 +309,14 @@ def advance(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loo
         voltage(car, before),
         command,
         fresh,
-        loop.sensors.readings,
+        loop.readings,
         jnp.asarray(getattr(loop.memory, "turn", 0)),
         loop.state.wall_contacts,
         loop.state.rolled_over,
-        planar.forces(car, before),
+        planar.forces(car, before, around.floor),
     )
-    return loop._replace(tick=after, state=state, sensors=sensors, up=up, down=down), record
+    loop = loop._replace(tick=after, state=state, sensors=sensors, up=up, down=down, faulty=faulty)
+    return loop, record
 
 
 def voltage(car: Car, motion: Motion) -> Scalar:
