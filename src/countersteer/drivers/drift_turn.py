@@ -12,7 +12,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import Array, Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers import straighten
-from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.driver import Command, Observation, paced
 from countersteer.drivers.stop_angle import StopAngle, interpolate
 from countersteer.drivers.straighten import Straighten
 from countersteer.errors import InputError
@@ -41,6 +41,16 @@ class Memory(NamedTuple):
     odd: Scalar  # by how much the last that was not believed differed, m
     odds: Scalar  # how many in a row agreed on that
     straight: straighten.Memory
+
+    @property
+    def time(self) -> Scalar:
+        """Of the last thought (s)."""
+        return self.straight.time
+
+    @property
+    def command(self) -> Command:
+        """The last."""
+        return self.straight.command
 
 
 @pytree
@@ -110,8 +120,11 @@ class DriftTurn:
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
-        seen, now, own = observation, observation.time, self.turning
-        dt = now - memory.straight.time
+        return paced(self._think, memory, observation)
+
+    def _think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+        now, own = seen.time, self.turning
+        dt = now - memory.time
         straight = self.straight.follow(memory.straight, seen)
         estimate = seen.estimate
         angle = jnp.asarray(self.angles)[memory.turn]
@@ -168,7 +181,7 @@ class DriftTurn:
             jnp.where(begins, gap + corner * jnp.cos(angle), corner),
             jnp.where(begins, DOUBT**2, doubt),
             *spikes,
-            straight._replace(integral=integral),
+            straight._replace(integral=integral, command=command),
         )
 
     def _approach(
@@ -186,7 +199,7 @@ class DriftTurn:
         corner = memory.corner - dt * along
         doubt = memory.doubt + dt * SLIPPING**2
         heard = seen.sonar[self.front]
-        came = heard.age <= dt + 1e-9
+        came = heard.came(dt)
         stuck = (heard.value == memory.heard) & (along > 0.5)
         looks = (jnp.abs(error) < 0.3) & (memory.phase == STRAIGHT) & jnp.isfinite(heard.value)
         fresh = came & looks & ~stuck

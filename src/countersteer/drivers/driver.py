@@ -1,14 +1,20 @@
 """What every driver is given and gives back."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 
 from countersteer.car.parameter import Scalar
 from countersteer.estimation.estimate import Estimate
 from countersteer.world.planar import Command
 
-__all__ = ["Command", "Driver", "Heard", "Observation"]
+__all__ = ["Command", "Driver", "Heard", "Observation", "paced"]
+
+
+ROUNDING = 2e-5  # s, of a time in 32 bits
+THINKS = 0.005  # s between two thoughts of a driver: as often as gyroscope and estimate have news
 
 
 class Heard(NamedTuple):
@@ -16,6 +22,10 @@ class Heard(NamedTuple):
 
     value: Scalar
     age: Scalar  # s since it was taken; inf before the first
+
+    def came(self, within: Scalar) -> Scalar:
+        """Whether it was taken in the last so many seconds, the beginning not counted."""
+        return self.age < within - ROUNDING
 
 
 class Observation(NamedTuple):
@@ -53,3 +63,28 @@ class Driver(Protocol):
     def act(self, memory: Any, observation: Observation) -> tuple[Command, Any]:
         """The command for the next control period, and the memory after it."""
         ...
+
+
+def paced(
+    think: Callable[[Any, Observation], tuple[Command, Any]],
+    memory: Any,
+    seen: Observation,
+    period: float = THINKS,
+) -> tuple[Command, Any]:
+    """Thinks when it is time to, and asks for the same as before in between.
+
+    The memory has a `time`, that of the last thought, and the `command` that came of it.
+    """
+
+    def typed(memory: Any, seen: Observation) -> tuple[Command, Any]:
+        return jax.tree.map(
+            lambda new, old: jnp.asarray(new, jnp.result_type(old)),
+            think(memory, seen),
+            (memory.command, memory),
+        )
+
+    due = seen.time - memory.time > period - ROUNDING
+    held: tuple[Command, Any] = jax.lax.cond(
+        due, typed, lambda same, _: (same.command, same), memory, seen
+    )
+    return held

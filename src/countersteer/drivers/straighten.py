@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from countersteer.car.car import Car
 from countersteer.car.parameter import Scalar, pytree
 from countersteer.course.course import Course
-from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.driver import Command, Observation, paced
 from countersteer.errors import InputError
 from countersteer.estimation.wall_angle import WallAngle, wall_angle
 
@@ -27,6 +27,7 @@ class Memory(NamedTuple):
     heading: Scalar  # the estimate's, rad
     time: Scalar
     walls: Any  # the filter's; () without
+    command: Command  # the last
 
 
 @pytree
@@ -59,12 +60,17 @@ class Straighten:
         walls: Any = ()
         if self.by == "filter":
             walls = self.walls.initial_memory(heading=self.bearing, dtype=float)
-        return Memory(0.0, 0.0, 0.0, self.bearing, 0.0, walls)
+        return Memory(0.0, 0.0, 0.0, self.bearing, 0.0, walls, Command(0.0, 0.0))
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """Steers to the middle at the speed that was asked for."""
-        memory = self.follow(memory, observation)
-        return self.command(memory, observation, self.speed), memory
+
+        def think(memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+            memory = self.follow(memory, seen)
+            command = self.command(memory, seen, self.speed)
+            return command, memory._replace(command=command)
+
+        return paced(think, memory, observation)
 
     def follow(self, memory: Memory, seen: Observation) -> Memory:
         """The memory with what is new: also while something else steers."""
@@ -84,6 +90,7 @@ class Straighten:
             seen.estimate.heading,
             seen.time,
             walls,
+            memory.command,
         )
 
     def _heard(self, offset: Scalar, error: Scalar, seen: Observation, dt: Scalar) -> Scalar:
@@ -96,7 +103,7 @@ class Straighten:
             at = side * (own.width / 2 - heard.value) - x * sine - y * cosine
             # Not a wall of this corridor, or one seen at a slant: a gap, or a turn under way.
             sees = (jnp.abs(at) < own.width / 2) & (jnp.abs(error) < math.radians(30))
-            news = (heard.age <= dt + 1e-9) & sees
+            news = heard.came(dt) & sees
             offset = offset + jnp.where(news, self.blend * (at - offset), 0.0)
         return offset
 

@@ -27,6 +27,7 @@ WALKS = (0.02, 0.02, 0.0005)  # growth of them, per root second
 STEEPEST = math.radians(30)  # angle to a wall beyond which it is not looked at
 GATE = 3.5  # standard deviations beyond which a reading is of something else than the wall
 FORGETS = 0.5  # s without a believed reading from which the offset is known less and less
+ROUNDING = 2e-5  # s, of a time in 32 bits
 CURVES = 0.03  # rad/m: deviation of the walls' bend in what the rooms call a straight
 
 
@@ -136,7 +137,7 @@ class WallAngle:
                 {OFFSET: 1.0, ANGLE: x * cosine - y * sine},
                 seen - (mean[OFFSET] + x * sine + y * cosine),
                 self.noise**2 + self.resolution**2 / 12 + 1e-8,
-                (ages[mount] < h + 1e-9)
+                (ages[mount] < h - ROUNDING)
                 & jnp.isfinite(sonar[mount].value)
                 & (jnp.abs(mean[ANGLE]) < STEEPEST),
                 GATE,
