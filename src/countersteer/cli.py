@@ -120,10 +120,10 @@ def parser() -> Parser:
     )
     drive.add_argument(
         "--estimate",
-        choices=("filter", "reckoning", "truth"),
+        choices=("filter", "pose", "reckoning", "truth"),
         default="filter",
-        help="what the driver knows of its motion: by the velocity filter (default), by dead "
-        "reckoning, both from the sensors; or the truth",
+        help="what the driver knows of its motion: by the velocity filter (default), dead "
+        "reckoning, by a particle filter of the pose (slower), all from the sensors; or the truth",
     )
 
     replay = verb("replay", "commands in, motion out; or a log against the simulator", run_replay)

@@ -51,6 +51,13 @@ class Pose(NamedTuple):
     share: Scalar
 
 
+class Located(NamedTuple):
+    """The cloud, what was best at its last step, and the velocity filter's estimate then."""
+
+    cloud: Memory
+    pose: Pose
+
+
 @pytree
 class PoseFilter:
     """For a course (walls (n, 4), rows of NaN are padding) and the nominal car's sonar."""
@@ -97,8 +104,10 @@ class PoseFilter:
         weight = jnp.full_like(x, -math.log(len(x)))
         return Memory(x, y, heading, weight, motion, ticks, key)
 
-    def update(self, memory: Memory, sonar: tuple[Reading, ...], now: Estimate, h: Scalar) -> Memory:
-        """h seconds later: moved by the velocity filter's motion, weighed by what is new."""
+    def update(
+        self, memory: Memory, sonar: tuple[Reading, ...], now: Estimate, h: Scalar
+    ) -> Memory:
+        """The cloud after h seconds: moved with the velocity filter, weighed by what is new."""
         key, move_key, draw_key = jax.random.split(memory.key, 3)
         x, y, heading = self.moved(memory, now, h, move_key)
         fresh = [r.tick > tick for r, tick in zip(sonar, memory.ticks, strict=True)]
@@ -219,7 +228,23 @@ def best(memory: Memory) -> Pose:
     return Pose(x, y, heading, covariance, share)
 
 
-def _nearest(sonar: Sonar, walls: jax.Array, x: jax.Array, y: jax.Array, bearing: jax.Array) -> jax.Array:
+def located(memory: Located, now: Estimate) -> Estimate:
+    """The velocity filter's estimate with the pose put right, carried on since the last step."""
+    pose, then = memory.pose, memory.cloud.motion
+    off = pose.heading - then.heading
+    cosine, sine = jnp.cos(off), jnp.sin(off)
+    dx, dy = now.x - then.x, now.y - then.y
+    return now._replace(
+        x=pose.x + cosine * dx - sine * dy,
+        y=pose.y + sine * dx + cosine * dy,
+        heading=now.heading + off,
+        pose_covariance=pose.covariance,
+    )
+
+
+def _nearest(
+    sonar: Sonar, walls: jax.Array, x: jax.Array, y: jax.Array, bearing: jax.Array
+) -> jax.Array:
     """(particles,): the nearest of all walls' nearest points within the cone."""
     ax, ay, bx, by = (walls[:, i] - at[:, None] for i, at in enumerate((x, y, x, y)))
     length = jnp.sqrt((bx - ax) ** 2 + (by - ay) ** 2 + 1e-18)

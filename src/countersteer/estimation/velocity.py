@@ -186,7 +186,7 @@ def update(
         rim / car.tires.rear.radius,
     )
     guess = single_track.step(car, memory.ahead, actuators, drive, memory.friction, h)
-    # Between two readings the last one is held: measured to be the better guess (docs/estimation.md).
+    # Between two readings the last one is held: measured to be the better guess.
     held = rotated(memory.ahead, h * memory.ahead.yaw)
     ahead = Vector(
         jnp.where(accel_sound, held.x + h * memory.accel_x, guess.x),
@@ -305,7 +305,7 @@ def update(
 
     # Where the rear axle slides, its pull is its friction, against the slip.
     slip_y = mean[VY] - behind * mean[RATE]
-    slip_x = mean[VX] - readings.wheel_speed.value
+    slip_x = mean[VX] - arm * mean[RATE] - readings.wheel_speed.value
     rear = car.tires.rear
     against = -slip_y / jnp.sqrt(slip_x**2 + slip_y**2 + 1e-6)
     full = rear.sliding_ratio * rear.friction * against
