@@ -267,6 +267,21 @@ def test_a_standing_car_stays(drives):
     assert np.abs(estimate.heading[-1] - COURSE.start[2]).max() < math.radians(2)
 
 
+def test_a_start_that_was_not_at_rest_is_found_out(drives):
+    """The same readings from 0.6 s on, when the cars are under way."""
+    late = 120
+
+    def later(leaf):
+        moved = np.roll(leaf, -late, axis=0)
+        return moved - late * STEP if leaf.dtype.kind == "i" else moved
+
+    readings = jax.tree.map(later, drives.record.readings)
+    estimate = believed(drives, **readings._asdict())[0]
+    truth = np.roll(drives.record.motion.vx, -late, axis=0)
+    assert np.abs(estimate.vx[0] - truth[0]).min() > 0.8
+    assert rms(estimate.vx[80:90] - truth[80:90]) < 0.2
+
+
 @pytest.mark.parametrize("left", ["sound", "dead", "stuck"])
 def test_the_angle_to_the_wall_is_known_on_straights(drives, estimates, left):
     locator = jax.tree.map(np.float32, wall_angle(NOMINAL, COURSE.width))
