@@ -108,10 +108,11 @@ def parser() -> Parser:
         )
         made.add_argument(
             "--estimate",
-            choices=("filter", "reckoning", "truth"),
+            choices=("filter", "pose", "reckoning", "truth"),
             default="filter",
-            help="what the driver knows of its motion: by the velocity filter (default), by dead "
-            "reckoning, both from the sensors; or the truth",
+            help="what the driver knows of its motion: by the velocity filter (default), dead "
+            "reckoning, by a particle filter of the pose (slower), all from the sensors; or the "
+            "truth",
         )
 
     drive = verb("drive", "one closed-loop drive over a course", run_drive)

@@ -28,7 +28,7 @@ from countersteer.car.car import Car, Wheels
 from countersteer.car.parameter import Array, Scalar
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver, Heard, Observation
-from countersteer.estimation import dead_reckoning, velocity
+from countersteer.estimation import dead_reckoning, pose, velocity
 from countersteer.estimation.estimate import Estimate
 from countersteer.link.link import ONBOARD, Channel, Link, exchange, initial_channel
 from countersteer.sensing import faults, sonar, suite
@@ -41,6 +41,8 @@ from countersteer.world.state import Motion, State
 
 PIECE = 0.5  # s of car time that are scanned at once; records are flushed between pieces
 FILTERING = 0.005  # s between two steps of the velocity filter
+LOCATING = 0.025  # s between two steps of the pose filter
+PARTICLES = 500
 
 
 class Plan(NamedTuple):
@@ -112,7 +114,8 @@ class Simulator:
     `course` may be None: open floor. `car` is what is simulated; a driver knows only what it was
     made for. The precision is that of the car's leaves: 64-bit leaves run in 64 bits.
     `estimate` is "filter" (the velocity filter, which knows the `nominal` car: by default the car
-    itself), "reckoning" (dead reckoning) or "truth".
+    itself), "pose" (the same with a particle filter for the pose), "reckoning" (dead reckoning) or
+    "truth".
     """
 
     course: Course | None
@@ -183,7 +186,7 @@ class Simulator:
     def begin(self, plan: Plan) -> tuple[Surroundings, Loop]:
         """The loop before its first tick."""
         dtype = np.asarray(self.car.body.mass).dtype
-        pose = self.start or (self.course.start if self.course else (0.0, 0.0, 0.0))
+        start = self.start or (self.course.start if self.course else (0.0, 0.0, 0.0))
         walls = padded(self.course.walls if self.course else np.zeros((0, 4)), dtype)
         key, driver_key = jax.random.split(jax.random.key(self.seed))
         nominal = jax.tree.map(dtype.type, self.nominal or self.car)
@@ -193,13 +196,13 @@ class Simulator:
             cast = partial(jax.tree.map, dtype.type)
             around = around._replace(floor=cast(self.floor), faults=cast(self.faults))
         # What the driver takes for its start is the course's, wherever the car stands.
-        believed = self.course.start if self.course else pose
+        believed = self.course.start if self.course else start
         loop = begin(
             plan,
             self.car,
-            nominal,
+            around,
             self.driver,
-            pose,
+            start,
             believed,
             self.velocity,
             self.charge,
@@ -228,17 +231,17 @@ class Simulator:
 def begin(
     plan: Plan,
     car: Car,
-    nominal: Car,
+    around: Surroundings,
     driver: Driver,
-    pose: tuple[Scalar, Scalar, Scalar],
+    start: tuple[Scalar, Scalar, Scalar],
     believed: tuple[Scalar, Scalar, Scalar],
     moving: tuple[Scalar, Scalar, Scalar],
     charge: Scalar,
     key: jax.Array,
 ) -> Loop:
     """The loop before its first tick, with the pose that the driver believes; `key` is its."""
-    dtype = jnp.result_type(car.body.mass)
-    state = planar.initial_state(car, plan.dt, pose, moving, charge, plan.slots)
+    dtype, nominal = jnp.result_type(car.body.mass), around.nominal
+    state = planar.initial_state(car, plan.dt, start, moving, charge, plan.slots)
     sensors = suite.initial_memory(car, state.motion, plan.dt)
     zero = dtype.type(0)
     still = Command(zero, zero)
@@ -247,8 +250,12 @@ def begin(
         up = initial_channel(still, plan.control, plan.delay)
         down = initial_channel(sensors.readings, plan.telemetry, plan.delay)
     estimate: Any = dead_reckoning.initial_memory(believed, dtype)
-    if plan.estimate == "filter":
+    if plan.estimate in ("filter", "pose"):
         estimate = velocity.initial_memory(nominal, believed, dtype)
+    if plan.estimate == "pose":
+        known = velocity.estimate(nominal, estimate, plan.dt)
+        cloud = locator(around).known(believed, jax.random.fold_in(key, 1), PARTICLES, known)
+        estimate = estimate, pose.Located(cloud, pose.best(cloud))
     memory = driver.reset(key)
     if not jax.tree_util.all_leaves([driver]):
         memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
@@ -296,16 +303,8 @@ def observe(plan: Plan, around: Surroundings, loop: Loop) -> tuple[Loop, Observa
     """What the driver is told at this tick: the readings that it has heard, and the estimate."""
     readings = loop.readings if loop.down is None else loop.down.latest
     motion = loop.state.motion
-    if plan.estimate == "filter":
-
-        def filtered(memory: velocity.Memory) -> velocity.Memory:
-            return velocity.update(
-                around.nominal, memory, readings, loop.command, loop.tick, plan.dt
-            )
-
-        now = loop.tick % plan.filtering == 0
-        memory = jax.lax.cond(now, filtered, lambda same: same, loop.estimate)
-        known = velocity.estimate(around.nominal, memory, plan.dt)
+    if plan.estimate in ("filter", "pose"):
+        memory, known = estimated(plan, around, loop, readings)
     else:
         memory = dead_reckoning.update(loop.estimate, readings, plan.dt)
         known = memory.estimate
@@ -319,6 +318,35 @@ def observe(plan: Plan, around: Surroundings, loop: Loop) -> tuple[Loop, Observa
     told: Any = jax.tree.map(heard, readings, is_leaf=lambda node: isinstance(node, Reading))
     time = plan.dt * loop.tick.astype(jnp.result_type(motion.x))
     return loop._replace(estimate=memory), Observation(*(time, *told, known))
+
+
+def estimated(
+    plan: Plan, around: Surroundings, loop: Loop, readings: Readings
+) -> tuple[Any, Estimate]:
+    """The filters' memory at this tick, and what they believe."""
+    memory, place = loop.estimate if plan.estimate == "pose" else (loop.estimate, None)
+
+    def filtered(memory: velocity.Memory) -> velocity.Memory:
+        return velocity.update(around.nominal, memory, readings, loop.command, loop.tick, plan.dt)
+
+    now = loop.tick % plan.filtering == 0
+    memory = jax.lax.cond(now, filtered, lambda same: same, memory)
+    known = velocity.estimate(around.nominal, memory, plan.dt)
+    if place is None:
+        return memory, known
+    every = plan.filtering * max(1, round(LOCATING / plan.dt / plan.filtering))
+
+    def moved(place: pose.Located) -> pose.Located:
+        cloud = locator(around).update(place.cloud, readings.sonar, known, plan.dt * every)
+        return pose.Located(cloud, pose.best(cloud))
+
+    place = jax.lax.cond(loop.tick % every == 0, moved, lambda same: same, place)
+    return (memory, place), pose.located(place, known)
+
+
+def locator(around: Surroundings) -> pose.PoseFilter:
+    """The pose filter for these surroundings."""
+    return pose.PoseFilter(walls=around.walls, sonar=around.nominal.sensors.sonar)
 
 
 jitted_observe = jax.jit(observe, static_argnums=0)

@@ -61,9 +61,7 @@ def correct(
 
     `row` is the measurement's derivative by the states, `residual` measured less expected, `noise`
     its variance. Nothing changes where `valid` is false, or where the residual exceeds `gate`
-    standard deviations: what comes in may be NaN there. A variance never falls below what the
-    measurement's own noise leaves, whatever rounding does: P_ii >= h-part is kept by subtracting
-    p pᵀ / S, whose every entry is bounded by the prior's.
+    standard deviations: what comes in may be NaN there.
     """
     n = len(mean)
     across = [sum(a * entry(covariance, i, k) for k, a in row.items()) for i in range(n)]

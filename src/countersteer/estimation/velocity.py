@@ -45,6 +45,8 @@ BLIND_RATE = 1.0  # rad/s: of its yaw rate
 FRICTION = 0.1  # deviation of the friction scale at the start
 FELT = 0.09  # of a moment's friction
 FORGETS = 0.05  # of the friction scale, per root second
+LOST = 6  # reports of the encoder in a row, not believed, from which the speed is doubted
+UNSURE = 3.0  # m/s per root second, by which it then is
 GATE = 4.0  # standard deviations beyond which a reading is not believed
 GYRO_GATE = 6.0  # the same of the gyroscope: a yaw rate changes by jerks
 
@@ -176,7 +178,9 @@ def update(
     slip_speed = memory.ahead.y - behind * memory.ahead.yaw
     slip = jnp.abs(slip_speed) / (jnp.abs(memory.ahead.x) + 0.3)
     rolls = slip < ADHERES
-    rim = jnp.where(rolls, memory.ahead.x, readings.wheel_speed.value)
+    wheel = readings.wheel_speed.value
+    wheel = jnp.where(jnp.isfinite(wheel), wheel, memory.ahead.x)
+    rim = jnp.where(rolls, memory.ahead.x, wheel)
     drive = motor.drive(
         car.motor,
         car.drivetrain,
@@ -186,7 +190,7 @@ def update(
         rim / car.tires.rear.radius,
     )
     guess = single_track.step(car, memory.ahead, actuators, drive, memory.friction, h)
-    # Between two readings the last one is held: the better guess, as measured.
+    # Between two readings the last one is held: measured to be the better guess.
     held = rotated(memory.ahead, h * memory.ahead.yaw)
     ahead = Vector(
         jnp.where(accel_sound, held.x + h * memory.accel_x, guess.x),
@@ -252,6 +256,8 @@ def update(
     tire = car.tires.rear if "rear" in sensors.encoder.on else car.tires.front
     stretch = 1 + accel_x / (GRAVITY * car.tires.rear.longitudinal_stiffness)
     known = jnp.where(holds, HOLDS, SLIDES) ** 2 * 2 * MEMORY * h_settled
+    # A wheel that keeps rolling otherwise than it should: then it is the speed that is wrong.
+    astray = jnp.where(memory.lost >= LOST, UNSURE**2 * h_settled, 0.0)
     in_play = jnp.where(measured, h_settled, 0.0)
     covariance = predict(
         covariance,
@@ -260,7 +266,7 @@ def update(
             VY: {VX: -turn, RATE: -h_settled * vx, AY: -in_play},
             ROLLED: {VX: h_settled * stretch, RATE: -h_settled * arm},
         },
-        {VX: shaken, VY: shaken, ROLLED: known},
+        {VX: shaken + astray, VY: shaken, ROLLED: known},
     )
     # Half the turn before the push and half after it: a free velocity keeps its length.
     halfway = rotated(Vector(vx, vy, rate), turn / 2)
@@ -305,12 +311,12 @@ def update(
 
     # Where the rear axle slides, its pull is its friction, against the slip.
     slip_y = mean[VY] - behind * mean[RATE]
-    slip_x = mean[VX] - readings.wheel_speed.value
+    slip_x = mean[VX] - arm * mean[RATE] - wheel
     rear = car.tires.rear
     against = -slip_y / jnp.sqrt(slip_x**2 + slip_y**2 + 1e-6)
     full = rear.sliding_ratio * rear.friction * against
     sliding = rear.cornering_stiffness * jnp.abs(slip_y) > 4 * rear.friction * memory.friction * (
-        jnp.abs(readings.wheel_speed.value) + 0.1
+        wheel + 0.1
     )
     (friction,), ((friction_variance,),), _ = correct(
         (memory.friction,),

@@ -23,8 +23,12 @@ from countersteer.sensing.suite import Reading
 
 OFFSET, ANGLE, BIAS = range(3)
 START = (0.1, 0.05, 0.005)  # standard deviations at the start: m, rad, rad/s
-WALKS = (0.02, 0.02, 0.0005)  # growth of them, per root second
-STEEPEST = math.radians(30)  # angle to a wall beyond which it is not looked at
+WALKS = (0.02, 0.02, 0.001)  # growth of them, per root second
+TURNING = 1.0  # rad/s of yaw rate from which on no wall is looked at: it may be a corner's
+STEEPEST = math.radians(20)  # angle to a wall beyond which it is not looked at
+NEAREST = 0.08  # m from a wall within which no car's middle can be
+COARSE = 0.05  # m: error that a reading is credited with while the offset is hardly known
+REPEATS = 16  # equal readings after which a sonar counts as stuck
 GATE = 3.5  # standard deviations beyond which a reading is of something else than the wall
 FORGETS = 0.5  # s without a believed reading from which the offset is known less and less
 ROUNDING = 2e-5  # s, of a time in 32 bits
@@ -39,6 +43,8 @@ class Memory(NamedTuple):
     time: Scalar
     heading: Scalar  # the velocity filter's, at that time
     believed: Scalar  # time of the last reading that was believed
+    last: tuple[Scalar, ...]  # reading of each side sonar, m
+    repeats: tuple[Scalar, ...]  # of it in a row
 
     @property
     def offset(self) -> Scalar:
@@ -84,13 +90,17 @@ class WallAngle:
         dtype: type = np.float64,
     ) -> Memory:
         """At the start of a straight."""
+        none = tuple(0.0 for _ in self.mounts)
         return jax.tree.map(
             lambda value: jnp.asarray(value, dtype),
-            Memory((offset, angle, 0.0), diagonal(START), 0.0, heading, 0.0),
+            Memory((offset, angle, 0.0), diagonal(START), 0.0, heading, 0.0, none, none),
         )
 
-    def turned(self, memory: Memory, angle: Scalar, doubt: Scalar) -> Memory:
-        """The corridor beyond a corner of this angle: nothing is known of the offset there."""
+    def turned(self, memory: Memory, angle: Scalar, doubt: Scalar = 0.03) -> Memory:
+        """The corridor beyond a corner of this angle: nothing is known of the offset there.
+
+        `doubt` is what the corner adds to the angle's standard deviation (rad).
+        """
         bias = entry(memory.covariance, BIAS, BIAS)
         steep = entry(memory.covariance, ANGLE, ANGLE)
         covariance = diagonal([self.width / 4, jnp.sqrt(steep) + doubt, jnp.sqrt(bias)])
@@ -127,8 +137,16 @@ class WallAngle:
                 BIAS: WALKS[2] ** 2 * h,
             },
         )
-        believed = memory.believed
-        for mount, side, x, y in zip(self.mounts, self.sides, self.xs, self.ys, strict=True):
+        believed, last, repeats = memory.believed, [], []
+        for i, (mount, side) in enumerate(zip(self.mounts, self.sides, strict=True)):
+            x, y = self.xs[i], self.ys[i]
+            fresh = ages[mount] < h - ROUNDING
+            same = sonar[mount].value == memory.last[i]
+            repeats.append(
+                jnp.where(fresh, jnp.where(same, memory.repeats[i] + 1, 0.0), memory.repeats[i])
+            )
+            last.append(jnp.where(fresh, sonar[mount].value, memory.last[i]))
+            vague = entry(covariance, OFFSET, OFFSET) > (2 * COARSE) ** 2
             cosine, sine = jnp.cos(mean[ANGLE]), jnp.sin(mean[ANGLE])
             seen = side * (self.width / 2 - sonar[mount].value)
             mean, covariance, taken = correct(
@@ -136,17 +154,21 @@ class WallAngle:
                 covariance,
                 {OFFSET: 1.0, ANGLE: x * cosine - y * sine},
                 seen - (mean[OFFSET] + x * sine + y * cosine),
-                self.noise**2 + self.resolution**2 / 12 + 1e-8,
-                (ages[mount] < h - ROUNDING)
-                & jnp.isfinite(sonar[mount].value)
-                & (jnp.abs(mean[ANGLE]) < STEEPEST),
+                self.noise**2 + self.resolution**2 / 12 + jnp.where(vague, COARSE**2, 1e-8),
+                fresh
+                & (repeats[i] < REPEATS)
+                & (jnp.abs(seen) < self.width / 2 - NEAREST)  # false of inf and NaN too
+                & (jnp.abs(mean[ANGLE]) < STEEPEST)
+                & (jnp.abs(estimate.yaw_rate) < TURNING),
                 GATE,
             )
             believed = jnp.where(taken, time, believed)
         # Long without a believed reading: rather believe too little than shut them all out.
         lost = jnp.where(time - believed > FORGETS, (0.3 * self.width) ** 2 * h, 0.0)
         covariance = predict(covariance, {}, {OFFSET: lost})
-        return Memory(mean, covariance, time, estimate.heading, believed)
+        return Memory(
+            mean, covariance, time, estimate.heading, believed, tuple(last), tuple(repeats)
+        )
 
 
 def wall_angle(car: Car, width: float) -> WallAngle:

@@ -244,7 +244,7 @@ def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> Score:
     loop = begin(
         plan,
         own.car,
-        shared.nominal,
+        around,
         own.driver,
         pose,
         shared.start,
