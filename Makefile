@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; 
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: drive test check accuracy bench notebook clean
+.PHONY: drive test check accuracy recovery bench notebook clean
 
 drive: $(READY)
 	$(BIN)/countersteer drive box
@@ -20,6 +20,10 @@ check: $(READY)
 
 accuracy: $(READY)
 	$(BIN)/python -m countersteer.evaluation.accuracy docs/accuracy.md
+
+# Twenty fits: an hour or more on two cores.
+recovery: $(READY)
+	$(BIN)/python -m countersteer.evaluation.recovery docs/recovery.md
 
 bench: $(READY)
 	$(BIN)/countersteer bench --out docs/speed.md

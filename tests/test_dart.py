@@ -8,7 +8,7 @@ import pytest
 
 from countersteer.car.files import load_car
 from countersteer.errors import InputError
-from countersteer.evaluation.compare import compare, draw_comparison, sensed
+from countersteer.evaluation.compare import Compared, compare, draw_comparison, sensed, slides
 from countersteer.runs.dart import POINT_X, POINT_Y, import_dart
 from countersteer.runs.files import TRUTH, Table, TableWriter, command_rows, write_table
 from countersteer.runs.run import Run, read_run
@@ -277,6 +277,25 @@ def test_a_log_of_the_simulator_is_what_the_simulator_predicts(compared):
         assert result["median_abs_error"][name] < 0.01
     assert 5 <= result["transient"]["windows"] <= result["windows"]
     assert result["transient"]["persistence"]["rmse"]["vx_mps"] > 0.3
+
+
+def test_a_window_slides_where_the_car_goes_forward_and_reaches_20_degrees():
+    time = np.linspace(0.1, 1, 10)
+
+    def window(vx, vy):
+        series = {"vx_mps": vx, "vy_mps": vy}
+        return {
+            name: Compared(time, np.array(value), 0 * time, np.full(10, value[0]))
+            for name, value in series.items()
+        }
+
+    gentle = np.linspace(0, np.tan(np.radians(19)), 10)
+    hard = np.linspace(0, np.tan(np.radians(-21)), 10)
+    assert not slides(window(np.ones(10), gentle))
+    assert slides(window(np.ones(10), hard))
+    assert not slides(window(-np.ones(10), hard))
+    assert not slides(window(np.linspace(1, -0.1, 10), hard))
+    assert not slides({"yaw_rate_radps": window(np.ones(10), hard)["vy_mps"]})
 
 
 def test_another_car_is_told_apart(simulated, car, compared):

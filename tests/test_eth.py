@@ -8,6 +8,7 @@ import pytest
 from countersteer import cli
 from countersteer.car.files import load_car
 from countersteer.errors import InputError
+from countersteer.evaluation.compare import compare
 from countersteer.runs.eth import PERIOD, import_eth
 from countersteer.runs.run import Run, read_run
 
@@ -156,3 +157,16 @@ def test_the_real_logs_agree_with_themselves(tmp_path, name, seconds):
     slip = np.arctan2(truth["vy_mps"], truth["vx_mps"])
     apart = np.angle(np.exp(1j * (course - (truth["heading_rad"] + slip)[1:])))
     assert np.degrees(np.median(np.abs(apart[fast]))) < 3
+
+
+@needs_data
+def test_the_library_s_car_predicts_slides_that_it_was_not_fitted_to(tmp_path):
+    """After a second of open loop, at the median, in forward windows that reach 20 degrees."""
+    import_eth(DATA / "train_2.npz", tmp_path)
+    found, _ = compare(read_run(tmp_path / "train_2"), load_car("eth"), dt=0.002)
+    sliding = found["sliding"]
+    assert sliding["windows"] >= 15
+    for name, limit in (("vx_mps", 0.45), ("vy_mps", 0.18), ("yaw_rate_radps", 0.55)):
+        assert sliding["median_abs_error"][name] < limit, name
+        still = sliding["persistence"]["median_abs_error"][name]
+        assert sliding["median_abs_error"][name] < 0.7 * still, name

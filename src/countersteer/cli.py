@@ -256,6 +256,15 @@ def parser() -> Parser:
         "--validate", nargs="+", type=Path, default=[], metavar="RUN", help="judge on these runs"
     )
     tune.add_argument(
+        "--new",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUN",
+        help="runs since BASE was fitted to the others: fit to all, and say by how much BASE errs "
+        "more on these, and whether the driver should be learned again",
+    )
+    tune.add_argument(
         "--hold-out",
         type=number(0, 1, int),
         default=None,
@@ -595,17 +604,21 @@ def run_tune(options: argparse.Namespace) -> int:
     runs = [read_run(path) for path in options.runs]
     car, base = load_car(options.car), Path(options.car).stem
     if options.fit == "acceleration":
+        if options.new:
+            raise InputError("--new: --fit acceleration does not judge new runs")
         return tune_acceleration(options, runs, car)
     validation = [read_run(path) for path in options.validate]
-    named = {str(run.about.get("car_name", base)) for run in (*runs, *validation)}
+    new = [read_run(path) for path in options.new]
+    named = {str(run.about.get("car_name", base)) for run in (*runs, *validation, *new)}
     others = {name: load_car(name) for name in sorted(named & set(library()) - {base})}
-    return tune_all(options, runs, validation, base, car, others)
+    return tune_all(options, runs, validation, new, base, car, others)
 
 
 def tune_all(
     options: argparse.Namespace,
     runs: list[Any],
     validation: list[Any],
+    new: list[Any],
     base: str,
     car: "Car",
     others: dict[str, "Car"],
@@ -613,13 +626,16 @@ def tune_all(
     """A fit to windows of logs: cars by surface, a page beside them."""
     import jax
 
-    from countersteer.tuning import tune
+    from countersteer.tuning import relearn, tune
     from countersteer.tuning.advice import next_log
     from countersteer.viewing.tuning_page import write_tuning_page
 
     with jax.enable_x64(True):
         cars = tune.by_surface(base, car, others)
-        logs = tune.read_logs(runs, cars, tune.EVERY["judged"], base)
+        logs = old = tune.read_logs(runs, cars, tune.EVERY["judged"], base)
+        if new:
+            since = tune.read_logs(new, cars, tune.EVERY["judged"], base)
+            logs = old.joined(since)
         judged = (
             tune.read_logs(validation, cars, tune.EVERY["judged"], base) if validation else None
         )
@@ -632,6 +648,10 @@ def tune_all(
             "residuals": tune.residuals(result.cars, parts[0][1]),
             "next_log": next_log(about["parameters"]),
         }
+        if new:
+            about["new_runs"] = relearn.judge(
+                cars, result.cars, old, since, options.fit, hold_out, say
+            )
         drawn = tune.series(result.cars, parts)
     files = tune.write_cars(result, about, options.out)
     page = options.out.with_suffix(".html")
@@ -644,6 +664,8 @@ def tune_all(
         return DONE
     for line in tune.table_lines(about):
         print(line)
+    if new:
+        print(about["new_runs"]["said"])
     print(f"cars: {', '.join(map(str, files.values()))}; page: {page}")
     return DONE
 

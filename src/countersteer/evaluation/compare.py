@@ -8,7 +8,7 @@ gyroscope, against simulated ones with the same lag and quantum.
 
 A steady drift is predicted by doing nothing. So the same errors are given for the prediction that
 nothing changes (`persistence`), and all of it for those windows in which something does
-(`transient`).
+(`transient`), and for those in which the car drives forward and slides (`sliding`).
 """
 
 import math
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 HORIZON = 1.0  # s, unless told
 SAMPLE = 0.01  # s between the instants at which states are compared
+SLIDE = math.radians(20)  # sideslip that a sliding window reaches
 
 
 class Compared(NamedTuple):
@@ -114,11 +115,13 @@ def compare(
             "wheel_speed_mps and gyro_radps in telemetry.csv"
         )
     lively = [window for window in windows if changes(window)]
+    sliding = [window for window in windows if slides(window)]
     result = {
         "windows": len(windows),
         "horizon_s": round(ticks * dt, 9),
         **scores(windows),
         "transient": {"windows": len(lively), **scores(lively)},
+        "sliding": {"windows": len(sliding), **scores(sliding)},
     }
     series_of_all = {
         "title": run.path.name,
@@ -212,6 +215,15 @@ def changes(window: Window) -> bool:
         for name, limit in limits.items()
         if name in window
     )
+
+
+def slides(window: Window) -> bool:
+    """Whether the car goes forward all through the window and reaches `SLIDE`, as measured."""
+    if not {"vx_mps", "vy_mps"} <= window.keys():
+        return False
+    both = (window["vx_mps"], window["vy_mps"])
+    vx, vy = (np.append(one.unchanged[:1], one.measured) for one in both)
+    return bool(np.all(vx > 0) and np.any(np.arctan2(np.abs(vy), vx) >= SLIDE))
 
 
 def scores(windows: Iterable[Window]) -> dict[str, Any]:

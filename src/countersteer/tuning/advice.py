@@ -39,6 +39,7 @@ LOGS = {  # a log, and the parameters that show in it
         "drivetrain.drag",
         "drivetrain.drag_viscous",
     ),
+    "steps of throttle in reverse, each from rest until the speed is steady": ("motor.reverse",),
     "slow circles at full lock to both sides": ("servo.limit_left", "servo.limit_right"),
     "slow circles at a quarter and at half lock to both sides": (
         "servo.gain_left",

@@ -67,6 +67,7 @@ SPEEDS = (
     "motor.full_throttle",
     "motor.conduction",
     "motor.neutral_brake",
+    "motor.reverse",
     "motor.lag",
     "motor.delay",
     "motor.rotor_inertia",

@@ -36,6 +36,16 @@ class Logs(NamedTuple):
         shots = fit.taken(self.shots, chosen)
         return self._replace(shots=shots, run=self.run[chosen], start=self.start[chosen])
 
+    def joined(self, other: "Logs") -> "Logs":
+        """With the windows of other runs after these."""
+        return Logs(
+            self.runs + other.runs,
+            self.masked + other.masked,
+            shooting.joined([self.shots, other.shots]),
+            np.concatenate([self.run, other.run + len(self.runs)]),
+            np.concatenate([self.start, other.start]),
+        )
+
 
 def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: str) -> Logs:
     """The windows of runs without what is false in them.

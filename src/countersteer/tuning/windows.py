@@ -110,9 +110,10 @@ def read_measured(run: Run, car: Car) -> Measured:
     if truth is not None and len(truth):
         time = truth["time_s"]
         if {"vx_mps", "vy_mps", "yaw_rate_radps"} <= truth.keys():
-            vx = Signal(time, truth["vx_mps"])
-            vy = Signal(time, truth["vy_mps"])
-            yaw_rate = Signal(time, truth["yaw_rate_radps"])
+            when = time - float(run.about.get("velocity_lag_s", 0.0))  # as its importer measured
+            vx = Signal(when, truth["vx_mps"])
+            vy = Signal(when, truth["vy_mps"])
+            yaw_rate = Signal(when, truth["yaw_rate_radps"])
         else:
             vx, vy, yaw_rate = velocities(time, truth["x_m"], truth["y_m"], truth["heading_rad"])
         names = [f"wheel_{place}_radps" for place in ("fl", "fr", "rl", "rr")]

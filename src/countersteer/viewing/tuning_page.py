@@ -56,9 +56,10 @@ def write_tuning_page(
 
     `result` is what `countersteer tune` gives as JSON. In each of its `parameters`, `low` and
     `high` may say what was likely beforehand; else that is a factor of e about a positive prior.
-    `correlations`, if given, are [i, j, r] of parameters by their places. `series` has one entry a
-    run: `quantities`, measured over the whole log and simulated in windows, and `commands`. NaN
-    and None are numbers that are not known. Text is shown as text, whatever it contains.
+    `new_runs`, if given, says whether the driver should be learned again. `correlations`, if
+    given, are [i, j, r] of parameters by their places. `series` has one entry a run: `quantities`,
+    measured over the whole log and simulated in windows, and `commands`. NaN and None are numbers
+    that are not known. Text is shown as text, whatever it contains.
     """
     title = f"{result['car']}: fit of {result['fit']}"
     unfolded = [f"<li>{escape(line)}</li>" for line in result["masked"]]
@@ -110,6 +111,8 @@ def _headline(result: Mapping[str, Any]) -> str:
             '<p class="lead">Nothing was held out. All errors below are of what was fitted, and '
             "say little about other logs.</p>"
         ]
+    if "new_runs" in result:
+        paragraphs.insert(0, f'<p class="lead">{escape(result["new_runs"]["said"])}</p>')
     open_, bound = (
         [escape(str(name)) for name in result[key]] for key in ("not_determined", "at_bounds")
     )
