@@ -42,6 +42,9 @@ GROUP = 8  # derivatives that a lane takes at once
 OUTLYING = 0.5  # normalised residual at which the loss turns linear
 TOLERANCE = 1e-5
 PASSES = 40  # evaluations of a stage, at most
+INSIDE = 0.1  # widths that a start keeps from a bound: near one, the trust region is next to nothing
+STARTS = 4  # of the stage `drift`, whose cost has many minima
+SCATTER = 0.5  # widths by which those starts differ
 KNOWN = 0.7  # part of the prior's width under which a parameter counts as determined
 STRAIGHT = math.radians(4)  # steering under which a window is straight
 SLIDES = math.radians(10)  # sideslip from which it slides
@@ -58,6 +61,8 @@ TIRES = (
     "tires.rear.longitudinal_stiffness",
     "tires.front.sliding_ratio",
     "tires.rear.sliding_ratio",
+    "tires.front.longitudinal_ratio",
+    "tires.rear.longitudinal_ratio",
 )
 FLOOR = (*TIRES, *ROLLING)  # fitted for each surface by itself
 SPEEDS = (
@@ -89,13 +94,15 @@ ABSOLUTE = {  # the same, of a parameter that may as well be next to nothing, in
     "motor.neutral_brake": 0.2,
     "motor.lag": 0.05,
     "motor.delay": 0.03,
-    "motor.rotor_inertia": 2e-6,
+    "motor.rotor_inertia": 1e-6,
     "drivetrain.drag_viscous": 1e-4,
     "servo.trim": math.radians(2),
     "servo.lag": 0.05,
     "servo.delay": 0.03,
     "tires.front.sliding_ratio": 0.1,
     "tires.rear.sliding_ratio": 0.1,
+    "tires.front.longitudinal_ratio": 0.2,
+    "tires.rear.longitudinal_ratio": 0.2,
 }
 
 
@@ -335,9 +342,10 @@ class Problem:
 
     def solve(self, u: Array, passes: int) -> Any:
         """SciPy's result, from u."""
+        inside = np.minimum(INSIDE * self.width, (self.high - self.low) / 4)
         return least_squares(
             self.residuals,
-            np.clip(u, self.low + 1e-6 * self.width, self.high - 1e-6 * self.width),
+            np.clip(u, self.low + inside, self.high - inside),
             jac=self.jacobian,
             bounds=(self.low, self.high),
             x_scale=self.width,
@@ -424,10 +432,12 @@ def fit(
             report(f"{name}: no window tells of it")
             continue
         problem = Problem(current, taken(shots, chosen), stage.parameters, cars)
-        solved = problem.solve(problem.inside(values(problem, current)), PASSES)
-        total += solved.nfev
-        current = problem.cars_at(solved.x)
-        report(f"{name}: {int(chosen.sum())} windows, cost {solved.cost:.4g}")
+        u = problem.inside(values(problem, current))
+        ends = [problem.solve(start, PASSES) for start in starts(problem, u, name)]
+        total += sum(end.nfev for end in ends)
+        current = problem.cars_at(min(ends, key=lambda end: end.cost).x)
+        costs = ", ".join(f"{end.cost:.4g}" for end in ends)
+        report(f"{name}: {int(chosen.sum())} windows, cost {costs}")
     stage = STAGES[what]
     chosen = stage.chooses(shots)
     if not chosen.any():
@@ -435,6 +445,13 @@ def fit(
     report(f"{what}: {int(chosen.sum())} windows")
     part = taken(shots, chosen)
     return believed(cars, current, part, stage.parameters, run_of[chosen], total, report)
+
+
+def starts(problem: Problem, u: np.ndarray, stage: str) -> list[np.ndarray]:
+    """Where the solver sets out: u, and for `drift` points scattered about it, always the same."""
+    draws = np.random.default_rng(0).normal(size=(STARTS - 1, len(u)))
+    scattered = u + SCATTER * problem.width * draws
+    return [u, *(scattered if stage == "drift" else ())]
 
 
 def taken(shots: Shots, chosen: np.ndarray) -> Shots:
