@@ -42,9 +42,7 @@ GROUP = 8  # derivatives that a lane takes at once
 OUTLYING = 0.5  # normalised residual at which the loss turns linear
 TOLERANCE = 1e-5
 PASSES = 40  # evaluations of a stage, at most
-INSIDE = 0.1  # widths that a start keeps from a bound: near one, the trust region is next to nothing
-STARTS = 4  # of the stage `drift`, whose cost has many minima
-SCATTER = 0.5  # widths by which those starts differ
+INSIDE = 0.1  # widths that a start keeps from a bound: the trust region is tiny near one
 KNOWN = 0.7  # part of the prior's width under which a parameter counts as determined
 STRAIGHT = math.radians(4)  # steering under which a window is straight
 SLIDES = math.radians(10)  # sideslip from which it slides
@@ -432,12 +430,10 @@ def fit(
             report(f"{name}: no window tells of it")
             continue
         problem = Problem(current, taken(shots, chosen), stage.parameters, cars)
-        u = problem.inside(values(problem, current))
-        ends = [problem.solve(start, PASSES) for start in starts(problem, u, name)]
-        total += sum(end.nfev for end in ends)
-        current = problem.cars_at(min(ends, key=lambda end: end.cost).x)
-        costs = ", ".join(f"{end.cost:.4g}" for end in ends)
-        report(f"{name}: {int(chosen.sum())} windows, cost {costs}")
+        solved = problem.solve(problem.inside(values(problem, current)), PASSES)
+        total += solved.nfev
+        current = problem.cars_at(solved.x)
+        report(f"{name}: {int(chosen.sum())} windows, cost {solved.cost:.4g}")
     stage = STAGES[what]
     chosen = stage.chooses(shots)
     if not chosen.any():
@@ -445,13 +441,6 @@ def fit(
     report(f"{what}: {int(chosen.sum())} windows")
     part = taken(shots, chosen)
     return believed(cars, current, part, stage.parameters, run_of[chosen], total, report)
-
-
-def starts(problem: Problem, u: np.ndarray, stage: str) -> list[np.ndarray]:
-    """Where the solver sets out: u, and for `drift` points scattered about it, always the same."""
-    draws = np.random.default_rng(0).normal(size=(STARTS - 1, len(u)))
-    scattered = u + SCATTER * problem.width * draws
-    return [u, *(scattered if stage == "drift" else ())]
 
 
 def taken(shots: Shots, chosen: np.ndarray) -> Shots:
