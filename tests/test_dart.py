@@ -371,7 +371,11 @@ def test_a_real_drift_is_compared_in_all_four_quantities(imported):
     still = result["transient"]["persistence"]["median_abs_error"]
     assert 0.2 < still["vx_mps"] < 1.0
     assert 0.2 < still["vy_mps"] < 1.0
-    assert result["rmse"]["wheel_speed_mps"] < 2.0
+    # The car was fitted to parts of it: what docs/tuning.md says of that, with little to spare.
+    for quantity, most in (("vx_mps", 0.07), ("vy_mps", 0.045), ("yaw_rate_radps", 0.16)):
+        assert result["median_abs_error"][quantity] < most, quantity
+        error = result["transient"]["median_abs_error"][quantity]
+        assert error < 0.3 * still[quantity], quantity
 
 
 @needs_data

@@ -201,3 +201,34 @@ def test_a_late_line_is_interpolated_to_fractions_of_a_tick():
     with jax.enable_x64(True):
         late = np.asarray(shooting._late(line, 0.5))
     np.testing.assert_allclose(late, [0, 0, 0.5, 1.0, 2.0])
+
+
+def test_the_taped_car_settles_into_the_drift_of_its_log(tmp_path):
+    time = np.arange(0, 10, 0.05)
+    commands = tmp_path / "commands.csv"
+    write_commands(commands, time, np.ones_like(time), np.full_like(time, math.radians(-25)))
+    out = tmp_path / "drift"
+    assert main(["replay", str(commands), "--car", "jetracer-tape", "--out", str(out)]) == 0
+    truth = read_run(out).truth
+    late = truth["time_s"] > 8
+    sideslip = np.degrees(np.arctan2(truth["vy_mps"][late], truth["vx_mps"][late]))
+    assert np.median(sideslip) == pytest.approx(58.7, abs=5)  # 54.5
+    assert np.median(truth["yaw_rate_radps"][late]) == pytest.approx(-4.0, abs=0.3)
+
+
+def test_a_replay_starts_from_the_charge_that_is_given(logs, tmp_path, capsys):
+    runs, _ = logs
+    speed = {}
+    for charge in (1.0, 0.1):
+        out = tmp_path / f"{charge}"
+        command = ["replay", str(runs[0].path / "commands.csv"), "--car", "jetracer-tape"]
+        main([*command, "--battery", f"{charge}", "--out", str(out)])
+        speed[charge] = np.max(np.abs(read_run(out).truth["vx_mps"]))
+    assert speed[0.1] < 0.95 * speed[1.0]
+    errors = []
+    for charge in (1.0, 0.1):
+        command = ["replay", str(runs[0].path), "--compare", "--json", "--out", str(tmp_path / "c")]
+        capsys.readouterr()
+        assert main([*command, "--battery", f"{charge}"]) == 0
+        errors.append(json.loads(capsys.readouterr().out)["rmse"]["wheel_speed_mps"])
+    assert errors[0] < 0.02 < errors[1]

@@ -754,11 +754,13 @@ def brush(tire: Car, slip_x: float, slip_y: float, rim: float) -> tuple[float, f
     tread = math.hypot(rim, tire.creep_speed)
     pull = np.array([tire.longitudinal_stiffness, tire.cornering_stiffness])
     pull = pull * [slip_x, slip_y] / tread
-    deflected = 2 * u * np.hypot(*pull)
+    ellipse = tire.longitudinal_ratio
+    deflected = 2 * u * math.hypot(pull[0] / ellipse, pull[1])
     adheres = deflected <= tire.friction * pressure
     held = pull * np.mean(np.where(adheres, 2 * u, 0))
     slides = tire.sliding_ratio * tire.friction * np.mean(np.where(adheres, 0, pressure))
-    return tuple(-held - slides * np.array([slip_x, slip_y]) / math.hypot(slip_x, slip_y))
+    along = np.array([ellipse**2 * slip_x, slip_y])  # normal to the ellipse of friction
+    return tuple(-held - slides * along / math.hypot(ellipse * slip_x, slip_y))
 
 
 def force(tire: Car, load: float, slip_x: float, slip_y: float, rim: float) -> tuple:
@@ -776,6 +778,7 @@ def test_the_tyre_is_the_brush_model_bristle_by_bristle() -> None:
             sliding_ratio=rng.uniform(),
             longitudinal_stiffness=rng.uniform(1, 30),
             cornering_stiffness=rng.uniform(1, 30),
+            longitudinal_ratio=rng.choice([1.0, rng.uniform(0.5, 1.5)]),
         )
         rim = rng.uniform(-5, 5)
         slip = rng.normal(size=2) * rng.choice([0.01, 0.1, 1]) * abs(rim)
@@ -794,6 +797,20 @@ def test_the_tyre_is_fialas_cubic_for_one_stiffness_and_one_friction() -> None:
     x, y = force(tire, load, 0.6 * slip, -0.8 * slip, rim)
     np.testing.assert_allclose(x, -0.6 * cubic, rtol=1e-9)
     np.testing.assert_allclose(y, 0.8 * cubic, rtol=1e-9)
+
+
+@pytest.mark.parametrize("ellipse", [0.5, 1.0, 1.5])
+def test_a_sliding_contact_takes_out_the_most_energy_that_its_ellipse_allows(
+    ellipse: float,
+) -> None:
+    tire = dataclasses.replace(RX7.tires.rear, sliding_ratio=1.0, longitudinal_ratio=ellipse)
+    around = np.linspace(0, 2 * math.pi, 721)
+    forces = tire.friction * np.stack([ellipse * np.cos(around), np.sin(around)])
+    for angle in (0.0, 0.3, 1.0, math.pi / 2, 2.5):
+        slip = 3.0 * np.array([math.cos(angle), math.sin(angle)])
+        found = np.array(force(tire, 1.0, *slip, 0.5))
+        assert -found @ slip == pytest.approx(np.max(forces.T @ slip), rel=1e-4), angle
+        assert math.hypot(found[0] / ellipse, found[1]) == pytest.approx(tire.friction)
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.5, 0.9, 1.0])

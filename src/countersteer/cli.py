@@ -1,6 +1,7 @@
 """The command line: parse, call, print."""
 
 import argparse
+import dataclasses
 import json
 import math
 import os
@@ -189,6 +190,12 @@ def parser() -> Parser:
     physics(replay, None)
     replay.add_argument(
         "--initial", default="", metavar="STATES", help='such as "vx_mps=2,yaw_rate_radps=1"'
+    )
+    replay.add_argument(
+        "--battery",
+        type=number(0, 1),
+        metavar="F",
+        help="charge, 0 to 1 (default: the run's battery_charge, or else 1)",
     )
     replay.add_argument("--compare", action="store_true", help="measured against simulated")
     replay.add_argument(
@@ -473,6 +480,9 @@ def run_replay(options: argparse.Namespace) -> int:
     run = read_run(options.source) if options.source.is_dir() else None
     if run is None and not options.source.exists():
         raise InputError(f"{options.source}: no such run folder or commands.csv")
+    if options.battery is not None and run is not None:
+        about = {**run.about, "battery_charge": options.battery}
+        run = dataclasses.replace(run, about=about)
     if run is not None and options.car is None and run.car is not None and not options.set:
         car, name = run.car, str(run.about.get("car_name", "its own car"))
     else:
@@ -494,7 +504,9 @@ def run_replay(options: argparse.Namespace) -> int:
             first.get("vy_mps", 0.0),
             first.get("yaw_rate_radps", 0.0),
         )
-    charge = float(run.about.get("battery_charge", 1.0)) if run else 1.0
+    charge = 1.0 if options.battery is None else options.battery
+    if run is not None:
+        charge = float(run.about.get("battery_charge", 1.0))
     driver = Replay(
         times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
     )

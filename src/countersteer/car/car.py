@@ -107,6 +107,9 @@ class Tire:
     sliding_ratio: Scalar = parameter(
         0.9, "1", 0, 1, "friction of the sliding tread over that of the adhering tread"
     )
+    longitudinal_ratio: Scalar = parameter(
+        1.0, "1", 0.2, 3, "friction along the wheel over that across it; 1: the same every way"
+    )
     longitudinal_stiffness: Scalar = parameter(
         12.0, "1", 0.1, 200, "slope of force over slip ratio at zero slip, over the load"
     )

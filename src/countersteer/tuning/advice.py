@@ -21,6 +21,7 @@ LOGS = {  # a log, and the parameters that show in it
     ),
     "long slides: full throttle at full lock, held and then let go, with motion capture": (
         "tires.*.sliding_ratio",
+        "tires.*.longitudinal_ratio",
     ),
     "quick changes of steering from side to side below the limit of grip, yaw rate at 50 Hz or "
     "more": ("body.yaw_inertia",),

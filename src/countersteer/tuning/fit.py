@@ -42,6 +42,7 @@ GROUP = 8  # derivatives that a lane takes at once
 OUTLYING = 0.5  # normalised residual at which the loss turns linear
 TOLERANCE = 1e-5
 PASSES = 40  # evaluations of a stage, at most
+INSIDE = 0.1  # widths that a start keeps from a bound: the trust region is tiny near one
 KNOWN = 0.7  # part of the prior's width under which a parameter counts as determined
 STRAIGHT = math.radians(4)  # steering under which a window is straight
 SLIDES = math.radians(10)  # sideslip from which it slides
@@ -58,6 +59,8 @@ TIRES = (
     "tires.rear.longitudinal_stiffness",
     "tires.front.sliding_ratio",
     "tires.rear.sliding_ratio",
+    "tires.front.longitudinal_ratio",
+    "tires.rear.longitudinal_ratio",
 )
 FLOOR = (*TIRES, *ROLLING)  # fitted for each surface by itself
 SPEEDS = (
@@ -90,13 +93,15 @@ ABSOLUTE = {  # the same, of a parameter that may as well be next to nothing, in
     "motor.neutral_brake": 0.2,
     "motor.lag": 0.05,
     "motor.delay": 0.03,
-    "motor.rotor_inertia": 2e-6,
+    "motor.rotor_inertia": 1e-6,
     "drivetrain.drag_viscous": 1e-4,
     "servo.trim": math.radians(2),
     "servo.lag": 0.05,
     "servo.delay": 0.03,
     "tires.front.sliding_ratio": 0.1,
     "tires.rear.sliding_ratio": 0.1,
+    "tires.front.longitudinal_ratio": 0.2,
+    "tires.rear.longitudinal_ratio": 0.2,
 }
 
 
@@ -336,9 +341,10 @@ class Problem:
 
     def solve(self, u: Array, passes: int) -> Any:
         """SciPy's result, from u."""
+        inside = np.minimum(INSIDE * self.width, (self.high - self.low) / 4)
         return least_squares(
             self.residuals,
-            np.clip(u, self.low + 1e-6 * self.width, self.high - 1e-6 * self.width),
+            np.clip(u, self.low + inside, self.high - inside),
             jac=self.jacobian,
             bounds=(self.low, self.high),
             x_scale=self.width,

@@ -49,7 +49,7 @@ def contact(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed:
 
 
 def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar) -> Contact:
-    """The brush model with a parabolic pressure and two frictions.
+    """The brush model with a parabolic pressure, two frictions, and an ellipse of friction.
 
     Adhering tread has mu, sliding tread rho mu. With slip velocity s, tread speed
     V = sqrt((R w)² + creep²), stiffness c per unit of load F, and the linear force z = |c s / V|:
@@ -60,13 +60,19 @@ def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: S
     For rho = 1 and one stiffness this is Fiala's cubic, z - z²/3mu + z³/27mu². The adhering part
     pulls against the tread's deflection, the sliding part against the slip velocity itself, so
     full sliding opposes the motion whatever the two stiffnesses are. Both k are >= 0: a contact
-    takes energy out. The largest force is F mu (4 - 3 rho) / (3 - 2 rho)².
+    takes energy out. The largest force across the wheel is F mu (4 - 3 rho) / (3 - 2 rho)².
+
+    Where friction along the wheel is e mu, the forces lie in an ellipse, and of those on it a
+    sliding contact's takes out the most energy. That is the same law for the slip (e s_x, s_y) and
+    the force (F_x / e, F_y), as both have the same power.
 
     Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 3 (brush model); E. Fiala, VDI-Z 96,
-    1954.
+    1954; S. Goyal, A. Ruina, J. Papadopoulos, Wear 143, 1991 (limit surface, largest dissipation).
     """
     slowness = jax.lax.rsqrt(rim_speed**2 + tire.creep_speed**2)
-    linear_x = tire.longitudinal_stiffness * slowness
+    ellipse = tire.longitudinal_ratio
+    true_x, slip_x = slip_x, ellipse * slip_x
+    linear_x = tire.longitudinal_stiffness / ellipse**2 * slowness
     linear_y = tire.cornering_stiffness * slowness
     linear = jnp.sqrt((linear_x * slip_x) ** 2 + (linear_y * slip_y) ** 2 + TINY**2)
     slides = jnp.minimum(linear * (1 / (3 * tire.friction)), 1.0)
@@ -79,7 +85,8 @@ def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: S
     part_x = (slip_x**2 + TINY**2 / 2) * slip**2
     tangent_x = part_x * slope * linear_x + (1 - part_x) * k_x
     tangent_y = (1 - part_x) * slope * linear_y + part_x * k_y
-    return Contact(slip_x, slip_y, k_x, k_y, 0.0, 0.0, tangent_x, tangent_y)
+    k_x, tangent_x = ellipse**2 * k_x, ellipse**2 * tangent_x
+    return Contact(true_x, slip_y, k_x, k_y, 0.0, 0.0, tangent_x, tangent_y)
 
 
 def magic_formula(
@@ -164,4 +171,4 @@ def limit(tire: Tire, load: Scalar) -> Scalar:
     """The force that a contact can hold (N): a brush's adhering tread, or the formula's peak."""
     if tire.law == "magic-formula":
         return jnp.maximum(tire.magic_formula.p_dx1, tire.magic_formula.p_dy1) * load
-    return tire.friction * load
+    return tire.friction * jnp.maximum(tire.longitudinal_ratio, 1.0) * load
