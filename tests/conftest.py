@@ -18,6 +18,7 @@ from countersteer.evaluation.drive import drive as write_drive
 from countersteer.runs.run import Run, read_run
 from countersteer.simulator import Simulator, keep_programs
 from countersteer.world import planar
+from countersteer.world.floor import Floor
 from countersteer.world.state import Motion, State
 
 LANES = 32  # cars in a batch: always as many, so that there is one program
@@ -64,11 +65,11 @@ def start(car: Car, slots: int = SLOTS, **motion: object) -> State:
     return state._replace(motion=state.motion._replace(**motion))
 
 
-def _advance(cars, walls, state, throttle, steering, first, dt):
+def _advance(cars, walls, state, throttle, steering, first, dt, floors):
     def tick(state, inputs):
         count, *command = inputs
-        state = jax.vmap(planar.step, (0, 0, 0, 0, None, None))(
-            cars, walls, state, planar.Command(*command), count, dt
+        state = jax.vmap(planar.step, (0, 0, 0, 0, None, None, 0))(
+            cars, walls, state, planar.Command(*command), count, dt, floors
         )
         return state, (state.motion, state.airborne, state.wall_contacts, state.rolled_over)
 
@@ -87,7 +88,8 @@ def drive() -> Callable[..., Drive]:
     """Drives up to 32 cars at once: cars, states, commands, walls, step and number of ticks.
 
     A command is a number, an array by car, or an array (ticks, cars); walls are (n, 4) for all or
-    (cars, n, 4). `every` thins the record. There is one program for each precision.
+    (cars, n, 4); floors are one a car. `every` thins the record. There is one program for each
+    precision, with floors and without.
     """
     program = jax.jit(_advance)
 
@@ -100,6 +102,7 @@ def drive() -> Callable[..., Drive]:
         steering: object = 0.0,
         walls: np.ndarray | None = None,
         every: int = 1,
+        floors: list[Floor] | None = None,
     ) -> Drive:
         count = len(cars)
         assert count <= LANES
@@ -116,11 +119,18 @@ def drive() -> Callable[..., Drive]:
             np.broadcast_to(np.asarray(command, dtype), (ticks, count))[:, fill]
             for command in (throttle, steering)
         ]
+        ground = None if floors is None else stacked([floors[i] for i in fill])
         kept, seconds = [], jnp.asarray(dt, dtype)
         for piece in range(ticks // PIECE):
             span = slice(piece * PIECE, (piece + 1) * PIECE)
             state, record = program(
-                batch, around, state, *(c[span] for c in commands), np.int32(span.start), seconds
+                batch,
+                around,
+                state,
+                *(c[span] for c in commands),
+                np.int32(span.start),
+                seconds,
+                ground,
             )
             first = -(span.start + 1) % every  # so that ticks every, 2 every, ... are kept
             kept.append(jax.tree.map(lambda leaf, n=first: np.asarray(leaf)[n::every], record))

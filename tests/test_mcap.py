@@ -281,3 +281,23 @@ def test_what_the_layout_draws_is_in_the_file(box):
         return panels(tree["first"]) + panels(tree["second"])
 
     assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
+
+
+def test_a_lidars_reading_is_a_scan_over_its_field(tmp_path):
+    arguments = ("--set", "sensors.lidar.beams=9", "--set", "sensors.lidar.angle_deg=20")
+    commands = tmp_path / "commands.csv"
+    commands.write_text(
+        "time_s,throttle,direction,steering_deg\n0,0.5,forward,0\n0.3,0,forward,0\n"
+    )
+    out = tmp_path / "run"
+    cli.main(["drive", "box", "--driver", str(commands), "--json", "--out", str(out), *arguments])
+    told = [row for row in rows(out, "telemetry") if "lidar_00_m" in row]
+    scans = messages(out, "/lidar")
+    assert len(scans) == len(told) >= 10
+    for (_, log_time, scan), row in zip(scans, told, strict=True):
+        assert log_time == round(row["time_s"] * 1e9)
+        assert list(scan.ranges) == [row[f"lidar_0{i}_m"] for i in range(9)]
+        assert scan.end_angle == -scan.start_angle == pytest.approx(math.radians(120))
+    (_, _, moved), *_ = messages(out, "/tf")
+    (mount,) = [f for f in moved.transforms if f.child_frame_id == "lidar"]
+    assert 2 * math.atan2(mount.rotation.z, mount.rotation.w) == pytest.approx(math.radians(20))

@@ -3,19 +3,27 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import shapely
 
 from conftest import start, varied
-from countersteer.car.car import Car, LineDetector, Mount, Sonar
+from countersteer.car.car import Car, Lidar, LineDetector, Mount, Position, Sonar
 from countersteer.car.files import load_car
 from countersteer.course.course import place
 from countersteer.course.files import load_course
-from countersteer.sensing import parts, sonar, suite
+from countersteer.drivers.replay import Replay
+from countersteer.errors import InputError
+from countersteer.evaluation.drive import about_run
+from countersteer.evaluation.drive import drive as write_drive
+from countersteer.runs.run import read_run
+from countersteer.sensing import lidar, parts, sonar, suite
+from countersteer.simulator import Simulator
 from countersteer.world.state import Motion
 
 RX7 = load_car("rx7")
@@ -243,7 +251,7 @@ def listen() -> Callable[..., suite.Readings]:
         )
         key = jax.random.key(seed)
         first = jax.tree.map(lambda leaf: leaf[0], motion)
-        memory = jax.tree.map(jnp.asarray, suite.initial_memory(car, first))
+        memory = jax.tree.map(jnp.asarray, suite.initial_memory(car, first, DT))
         readings = program(car, motion, memory, key, suite.periods(car, DT))
         return jax.tree.map(np.asarray, readings)
 
@@ -284,8 +292,11 @@ def test_rates_hold_at_every_step_that_is_short_enough(dt: float) -> None:
         1 / sensors.voltmeter.rate,
     )
     for name, period, ticks in zip(
-        suite.Periods._fields, wanted, suite.periods(RX7, dt), strict=True
+        suite.Periods._fields, (*wanted, None, None), suite.periods(RX7, dt), strict=True
     ):
+        if period is None:
+            assert ticks is None, f"the rx7 has no {name}"
+            continue
         assert ticks * dt == pytest.approx(max(period, dt), rel=0.05), name
 
 
@@ -455,7 +466,7 @@ def test_the_eye_turns_with_the_car(listen: Callable) -> None:
 def test_without_lines_the_detector_is_not_there(listen: Callable) -> None:
     told = listen(RX7)
     assert told.line_crossings is told.line_speed is None
-    assert suite.initial_memory(RX7, start(RX7, 4).motion).eye is None
+    assert suite.initial_memory(RX7, start(RX7, 4).motion, DT).eye is None
 
 
 @pytest.mark.parametrize("name", ["box", "ess"])
@@ -490,3 +501,135 @@ def test_the_nearest_walls_in_the_cone_are_all_that_a_ping_needs(
     few, all_of_them = heard(24), heard(64)
     assert np.isfinite(few).mean() > 0.5
     assert np.array_equal(few, all_of_them)
+
+
+# Lidar and position: what better sensing would bring
+
+
+def with_part(**part: Any) -> Car:
+    """The rx7 with a sensor that it has not by itself."""
+    parts = jax.tree.map(np.float64, part)
+    return dataclasses.replace(RX7, sensors=dataclasses.replace(RX7.sensors, **parts))
+
+
+EXACT = Lidar(beams=37, noise=0.0, resolution=0.0, reach=3.0, x=0.1, y=-0.05, angle=0.4)
+
+
+def test_a_lidars_ranges_are_those_of_a_geometry_library() -> None:
+    seed, count = 7, 200
+    walls, poses = scenes(seed, count)
+    padded = np.full((count, 16, 4), np.nan)
+    padded[:, 3:11] = walls
+    program = jax.jit(jax.vmap(lambda w, p: lidar.ranges(EXACT, w, tuple(p), np.zeros(37))))
+    told = np.asarray(program(padded, poses))
+    bearings = 0.4 + math.radians(270) * ((np.arange(37) + 0.5) / 37 - 0.5)
+    np.testing.assert_allclose(lidar.bearings(EXACT), bearings)
+    expected = np.full(told.shape, np.inf)
+    for i, (scene, (x, y, heading)) in enumerate(zip(walls, poses, strict=True)):
+        lines = shapely.MultiLineString([wall.reshape(2, 2) for wall in scene])
+        eye = complex(x, y) + (0.1 - 0.05j) * np.exp(1j * heading)
+        for j, bearing in enumerate(heading + bearings):
+            end = eye + 3.0 * np.exp(1j * bearing)
+            met = shapely.LineString([(eye.real, eye.imag), (end.real, end.imag)])
+            met = met.intersection(lines)
+            if not met.is_empty:
+                expected[i, j] = met.distance(shapely.Point(eye.real, eye.imag))
+    assert 0.3 < np.isfinite(expected).mean() < 0.95
+    np.testing.assert_allclose(told, expected, atol=1e-4, err_msg=f"seed {seed}")
+
+
+def test_no_beam_slips_between_two_walls() -> None:
+    corner = np.array([[1.0, -3, 1.0, 1 / 3], [1.0, 1 / 3, -3.0, 1 / 3]], np.float32)
+    part = jax.tree.map(np.float32, dataclasses.replace(EXACT, beams=2000, reach=50.0, x=0, y=0))
+    toward = np.arctan2(1 / 3, 1.0) - part.angle
+    told = lidar.ranges(part, corner, (0.0, 0.0, np.float32(toward)), np.zeros(2000, np.float32))
+    away = np.asarray(lidar.bearings(part)) + toward
+    faces = (away > -1.2) & (away < 2.5)
+    assert faces.sum() > 1000
+    assert np.all(np.isfinite(np.asarray(told)[faces]))
+
+
+def test_a_lidar_reports_at_its_rate_with_its_noise_and_step(listen: Callable) -> None:
+    part = Lidar(beams=5, field=math.radians(10), rate=100.0, noise=0.02, resolution=0.005)
+    told = listen(with_part(lidar=part)).lidar
+    ticks = np.arange(1, TICKS + 1)
+    fresh_ticks = ticks[told.tick == ticks]
+    np.testing.assert_array_equal(fresh_ticks, np.arange(10, TICKS + 1, 10))
+    read = told.value[fresh_ticks - 1]
+    angles = np.radians(10) * ((np.arange(5) + 0.5) / 5 - 0.5)
+    np.testing.assert_allclose(read.mean(axis=0), 2.0 / np.cos(angles), atol=6e-3)
+    assert read.std(axis=0) == pytest.approx(0.02, rel=0.2)
+    np.testing.assert_allclose(read / 0.005, np.round(read / 0.005), atol=1e-9)
+    related = np.abs(np.corrcoef(read.T)) - np.eye(5)
+    assert related.max() < 0.35, "each beam's noise is its own"
+    assert np.isinf(told.value[0]).all()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.04])
+def test_a_position_tells_where_the_car_was_with_its_noise(listen: Callable, delay: float) -> None:
+    time = DT * np.arange(1, TICKS + 1)
+    x, y, heading = 3.0 * time, 1.0 - time**2, 4.0 * time
+    part = Position(
+        reports="pose", rate=250.0, noise=0.02, heading_noise=math.radians(2), delay=delay
+    )
+    told = listen(with_part(position=part), x=x, y=y, heading=heading)
+    ticks = fresh(told.position_x)
+    late = round(delay / DT)
+    np.testing.assert_array_equal(ticks, np.arange(4, TICKS + 1, 4)[late // 4 - (late > 0) :])
+    ticks = ticks[ticks > late]
+    then = DT * (ticks - late)
+    off = [
+        told.position_x.value[ticks - 1] - 3.0 * then,
+        told.position_y.value[ticks - 1] - (1.0 - then**2),
+        (told.position_heading.value[ticks - 1] - 4.0 * then + math.pi) % (2 * math.pi) - math.pi,
+    ]
+    assert np.abs(told.position_heading.value).max() <= math.pi
+    for error, deviation in zip(off, (0.02, 0.02, math.radians(2)), strict=True):
+        assert abs(error.mean()) < 4 * deviation / math.sqrt(len(error))
+        assert error.std() == pytest.approx(deviation, rel=0.15)
+    assert np.abs(np.corrcoef(off) - np.eye(3)).max() < 0.25
+
+
+def test_a_position_without_heading_and_parts_that_are_off_are_not_there(listen: Callable) -> None:
+    told = listen(with_part(position=Position(reports="place")))
+    assert told.position_heading is None
+    assert told.position_y is not None
+    none = listen(RX7)
+    assert none.lidar is none.position_x is none.position_y is none.position_heading is None
+    assert suite.initial_memory(RX7, start(RX7, 4).motion, DT).poses is None
+
+
+def test_better_sensors_are_switched_on_and_written(tmp_path: Path) -> None:
+    wanted = ("sensors.lidar.beams=12", "sensors.lidar.rate_hz=20", "sensors.position.reports=pose")
+    car = load_car("rx7", wanted)
+    simulator = Simulator(
+        None, car, Replay(times=np.zeros(1), throttle=np.ones(1), steering=np.zeros(1))
+    )
+    about = about_run(simulator, "replay", "rx7", 1)
+    assert about["rates"]["lidar_s"] == pytest.approx(0.05)
+    write_drive(simulator, tmp_path, about, 1, 0.5, lambda *_: None)
+    run = read_run(tmp_path)
+    assert run.car.sensors.lidar.beams == 12
+    told = run.telemetry
+    assert [name for name in told if name.startswith(("lidar", "position"))] == [
+        *(f"lidar_{i:02}_m" for i in range(12)),
+        *("position_x_m", "position_y_m", "position_heading_rad"),
+    ]
+    assert np.isinf(told["lidar_07_m"]).sum() == 9, "open floor: no echo, twenty a second"
+    heard = np.isfinite(told["position_x_m"])
+    assert heard.sum() == pytest.approx(48, abs=3)
+    late = np.interp(told["time_s"][heard] - 0.01, run.truth["time_s"], run.truth["x_m"])
+    np.testing.assert_allclose(told["position_x_m"][heard], late, atol=8e-3)
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("sensors.lidar.beams=2.5", "sensors.lidar.beams must be a whole number, not 2.5"),
+        ("sensors.lidar.beams=-1", "outside its range"),
+        ("sensors.position.reports=yes", "must be one of none, place, pose"),
+    ],
+)
+def test_what_cannot_be_switched_on_is_refused(override: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        load_car("rx7", [override])

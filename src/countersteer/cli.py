@@ -176,6 +176,14 @@ def parser() -> Parser:
     drive.add_argument(
         "--battery", type=number(0, 1), default=1.0, metavar="F", help="charge, 0 to 1 (default 1)"
     )
+    drive.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="TEXT",
+        help="a sensor that is dead, stuck or spiking for a while: 'SENSOR KIND START DURATION' in "
+        "seconds, such as 'gyroscope stuck 2.0 0.5' (repeatable)",
+    )
     laps_and_link(drive)
 
     evaluate = verb("evaluate", "drivers judged over randomised cars", run_evaluate)
@@ -425,13 +433,14 @@ def run_drive(options: argparse.Namespace) -> int:
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.link.link import LINKS
+    from countersteer.sensing.faults import read_fault
     from countersteer.simulator import Simulator
 
     course, car = load_course(options.course), load_car(options.car, options.set)
     check_laps(options, course)
-    charge, start, speed = options.battery, None, None
+    charge, start, speed, floor = options.battery, None, None, None
     if options.cars is not None:
-        car, charge, start, speed = drawn_alone(options, course, car)
+        car, charge, start, speed, floor = drawn_alone(options, course, car)
     elif options.speed_mps is not None:
         speed, most = options.speed_mps
         if most != speed:
@@ -449,7 +458,9 @@ def run_drive(options: argparse.Namespace) -> int:
         options.seed,
         charge,
         start=start,
+        floor=floor,
         nominal=load_car(options.car),
+        faults=tuple(read_fault(text) for text in options.fault),
     )
     # A lap at a crawl still ends.
     longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
@@ -463,7 +474,7 @@ def check_laps(options: argparse.Namespace, course: "Course") -> None:
 
 
 def drawn_alone(options: argparse.Namespace, course: "Course", car: "Car") -> tuple[Any, ...]:
-    """The trial of `--seed`: car, charge, start and speed asked for."""
+    """The trial of `--seed`: car, charge, start, speed asked for and floor."""
     import jax
     import numpy as np
 
@@ -474,8 +485,8 @@ def drawn_alone(options: argparse.Namespace, course: "Course", car: "Car") -> tu
     )
     speed = None if drawn.speed is None else float(drawn.speed[0])
     x, y, heading = (float(value) for value in drawn.pose[0])
-    alone = jax.tree.map(lambda leaf: leaf[0], drawn.cars)
-    return alone, float(drawn.charge[0]), (x, y, heading), speed
+    alone, floor = jax.tree.map(lambda leaf: leaf[0], (drawn.cars, drawn.floor))
+    return alone, float(drawn.charge[0]), (x, y, heading), speed, floor
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
@@ -535,6 +546,7 @@ def run_replay(options: argparse.Namespace) -> int:
     from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator
+    from countersteer.world.floor import floor_of_run
 
     if options.horizon and not options.compare:
         raise InputError("--horizon is of a comparison: give --compare as well")
@@ -579,6 +591,7 @@ def run_replay(options: argparse.Namespace) -> int:
         start=pose,
         velocity=velocity,
         charge=charge,
+        floor=floor_of_run(run.about) if run else None,
     )
     times = commands["time_s"]
     if times[-1] > LONGEST_REPLAY:

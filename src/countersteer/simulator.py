@@ -31,9 +31,11 @@ from countersteer.drivers.driver import Driver, Heard, Observation
 from countersteer.estimation import dead_reckoning, velocity
 from countersteer.estimation.estimate import Estimate
 from countersteer.link.link import ONBOARD, Channel, Link, exchange, initial_channel
-from countersteer.sensing import sonar, suite
+from countersteer.sensing import faults, sonar, suite
+from countersteer.sensing.faults import Fault
 from countersteer.sensing.suite import Reading, Readings
 from countersteer.world import drivetrain, motor, planar
+from countersteer.world.floor import Floor
 from countersteer.world.planar import Command
 from countersteer.world.state import Motion, State
 
@@ -54,6 +56,7 @@ class Plan(NamedTuple):
     filtering: int
     sensors: suite.Periods
     slots: int  # of the delay lines
+    fails: bool  # whether any sensor ever does
 
 
 class Surroundings(NamedTuple):
@@ -64,6 +67,8 @@ class Surroundings(NamedTuple):
     key: jax.Array
     loss: Scalar
     nominal: Car  # what the estimate knows of the car
+    floor: Floor | None = None  # None: the same friction everywhere
+    faults: tuple[Fault, ...] = ()
 
 
 class Loop(NamedTuple):
@@ -77,6 +82,12 @@ class Loop(NamedTuple):
     up: Channel | None
     down: Channel | None
     memory: Any  # the driver's
+    faulty: Readings | None = None  # what failing sensors have reported; None: none ever fails
+
+    @property
+    def readings(self) -> Readings:
+        """The sensors' last reports."""
+        return self.sensors.readings if self.faulty is None else self.faulty
 
 
 class Record(NamedTuple):
@@ -115,6 +126,12 @@ class Simulator:
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: tuple[float, float, float] | None = None  # instead of the course's
     nominal: Car | None = None
+    floor: Floor | None = None  # where friction varies from place to place
+    faults: tuple[Fault, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises `InputError` for a fault of a sensor that the car has not."""
+        faults.check(self.faults, self.car)
 
     def plan(self) -> Plan:
         """Periods in whole ticks, at least one each."""
@@ -131,6 +148,7 @@ class Simulator:
             control * max(1, round(FILTERING / self.dt / control)),
             suite.periods(self.car, self.dt),
             planar.delay_slots(self.car, self.dt),
+            bool(self.faults),
         )
 
     def run(self, longest: float) -> Generator[Record, None, None]:
@@ -171,6 +189,9 @@ class Simulator:
         nominal = jax.tree.map(dtype.type, self.nominal or self.car)
         loss = dtype.type(self.link.loss)
         around = Surroundings(walls, sonar.edges(walls), key, loss, nominal)
+        if self.floor is not None or self.faults:
+            cast = partial(jax.tree.map, dtype.type)
+            around = around._replace(floor=cast(self.floor), faults=cast(self.faults))
         # What the driver takes for its start is the course's, wherever the car stands.
         believed = self.course.start if self.course else pose
         loop = begin(
@@ -218,7 +239,7 @@ def begin(
     """The loop before its first tick, with the pose that the driver believes; `key` is its."""
     dtype = jnp.result_type(car.body.mass)
     state = planar.initial_state(car, plan.dt, pose, moving, charge, plan.slots)
-    sensors = suite.initial_memory(car, state.motion)
+    sensors = suite.initial_memory(car, state.motion, plan.dt)
     zero = dtype.type(0)
     still = Command(zero, zero)
     up = down = None
@@ -231,7 +252,8 @@ def begin(
     memory = driver.reset(key)
     if not jax.tree_util.all_leaves([driver]):
         memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
-    return Loop(np.int32(0), state, sensors, estimate, still, up, down, memory)
+    faulty = sensors.readings if plan.fails else None
+    return Loop(np.int32(0), state, sensors, estimate, still, up, down, memory, faulty)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -272,7 +294,7 @@ def hold(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loop, 
 
 def observe(plan: Plan, around: Surroundings, loop: Loop) -> tuple[Loop, Observation]:
     """What the driver is told at this tick: the readings that it has heard, and the estimate."""
-    readings = loop.sensors.readings if loop.down is None else loop.down.latest
+    readings = loop.readings if loop.down is None else loop.down.latest
     motion = loop.state.motion
     if plan.estimate == "filter":
 
@@ -319,7 +341,7 @@ def advance(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loo
         stops = silent & (up.arrived >= 0) if plan.timeout else jnp.asarray(False)
         command = up.latest._replace(throttle=jnp.where(stops, 0.0, up.latest.throttle))
         fresh = fresh | (stops & (loop.tick - up.arrived == plan.timeout + 1))
-    state = planar.step(car, around.walls, loop.state, command, loop.tick, plan.dt)
+    state = planar.step(car, around.walls, loop.state, command, loop.tick, plan.dt, around.floor)
     after = loop.tick + 1
     sensors = suite.sense(
         car,
@@ -332,8 +354,13 @@ def advance(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loo
         plan.sensors,
         plan.dt,
     )
+    readings, faulty = sensors.readings, loop.faulty
+    if faulty is not None:
+        readings = faulty = faults.report(
+            around.faults, car, faulty, readings, around.key, after, plan.dt
+        )
     if down is not None:
-        down = exchange(down, sensors.readings, lost[1], after, plan.telemetry, plan.delay)
+        down = exchange(down, readings, lost[1], after, plan.telemetry, plan.delay)
     before = loop.state.motion
     record = Record(
         loop.tick,
@@ -341,13 +368,14 @@ def advance(plan: Plan, car: Car, around: Surroundings, loop: Loop) -> tuple[Loo
         voltage(car, before),
         command,
         fresh,
-        loop.sensors.readings,
+        loop.readings,
         jnp.asarray(getattr(loop.memory, "turn", 0)),
         loop.state.wall_contacts,
         loop.state.rolled_over,
-        planar.forces(car, before),
+        planar.forces(car, before, around.floor),
     )
-    return loop._replace(tick=after, state=state, sensors=sensors, up=up, down=down), record
+    loop = loop._replace(tick=after, state=state, sensors=sensors, up=up, down=down, faulty=faulty)
+    return loop, record
 
 
 def voltage(car: Car, motion: Motion) -> Scalar:

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import NamedTuple
 
-from countersteer.car.parameter import Scalar, choice, parameter, pytree
+from countersteer.car.parameter import Scalar, choice, count, parameter, pytree
 
 GRAVITY = 9.81  # m/s²
 COMMONROAD = "CommonRoad vehicle models 3.0.2, tyre of its vehicles"
@@ -338,6 +338,38 @@ class LineDetector:
 
 
 @pytree
+class Lidar:
+    """A laser that looks along many beams at one instant. Off (0 beams) by default."""
+
+    beams: int = count(
+        0, 0, 2000, "beams, each in the middle of its part of the field; 0: no lidar"
+    )
+    field: Scalar = parameter(270.0, "rad", 1, 360, "angle that the beams cover")
+    rate: Scalar = parameter(40.0, "Hz", 0.1, 1000, "readings a second, of all beams at once")
+    reach: Scalar = parameter(10.0, "m", 0.1, 300, "largest distance")
+    noise: Scalar = parameter(0.01, "m", 0, 1, "standard deviation of a distance")
+    resolution: Scalar = parameter(0.001, "m", 0, 1, "step of a distance")
+    x: Scalar = parameter(0.0, "m", -5, 5, "forward of the centre of mass")
+    y: Scalar = parameter(0.0, "m", -3, 3, "left of the centre of mass")
+    angle: Scalar = parameter(0.0, "rad", -180, 180, "middle of the field, from straight ahead")
+
+
+@pytree
+class Position:
+    """Place from outside: of the centre of mass, in the world's axes. Off by default."""
+
+    reports: str = choice(
+        "none",
+        ("none", "place", "pose"),
+        "none: no such sensor; place: x and y, as GPS; pose: heading too, as motion capture",
+    )
+    rate: Scalar = parameter(100.0, "Hz", 0.1, 1000, "readings a second")
+    noise: Scalar = parameter(0.001, "m", 0, 100, "standard deviation of x and of y")
+    heading_noise: Scalar = parameter(0.3, "rad", 0, 180, "standard deviation of the heading")
+    delay: Scalar = parameter(0.01, "s", 0, 1, "from the instant that is told to the reading")
+
+
+@pytree
 class Sensors:
     """What the car carries to sense with."""
 
@@ -347,6 +379,8 @@ class Sensors:
     accelerometer: Accelerometer = Accelerometer()
     voltmeter: Voltmeter = Voltmeter()
     line_detector: LineDetector = LineDetector()
+    lidar: Lidar = Lidar()
+    position: Position = Position()
 
 
 @pytree

@@ -54,6 +54,7 @@ class Declaration:
     meaning: str
     source: str
     choices: tuple[str, ...] = ()
+    whole: bool = False
 
 
 def parameter(
@@ -63,6 +64,12 @@ def parameter(
     factor = EDGE[unit][1]
     declared = Declaration(unit, low * factor, high * factor, meaning, source)
     return dataclasses.field(default=default * factor, metadata={"declared": declared})
+
+
+def count(default: int, low: int, high: int, meaning: str, source: str = "assumed") -> Any:
+    """Declare a whole number that is the size of something; it is static under `jit`."""
+    declared = Declaration("1", low, high, meaning, source, whole=True)
+    return dataclasses.field(default=default, metadata={"declared": declared, "static": True})
 
 
 def choice(default: str, choices: tuple[str, ...], meaning: str, source: str = "assumed") -> Any:
@@ -108,12 +115,17 @@ def read_value(where: str, key: str, declared: Declaration, value: Any) -> Any:
     slack = 1e-12 * max(abs(low), abs(high))  # a bound survives the round trip through degrees
     if not low - slack <= value <= high + slack:  # false for NaN too
         raise InputError(f"{where}: {key} = {value:g} is outside its range [{low:g}, {high:g}]")
+    if declared.whole:
+        if value != int(value):
+            raise InputError(f"{where}: {key} must be a whole number, not {value:g}")
+        return int(value)
     return float(value) * factor
 
 
 def write_value(declared: Declaration, value: Any) -> Any:
     """The inverse of `read_value`, for files."""
-    return value if declared.choices else float(value) / EDGE[declared.unit][1]
+    plain = declared.choices or declared.whole
+    return value if plain else float(value) / EDGE[declared.unit][1]
 
 
 def edge_unit(declared: Declaration) -> str:

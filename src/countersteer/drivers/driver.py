@@ -31,6 +31,10 @@ class Observation(NamedTuple):
     battery: Heard  # V
     line_crossings: Heard | None  # lines entered; None: the car has no line detector
     line_speed: Heard | None  # m/s, never negative
+    lidar: Heard | None  # (beams,), m, from right to left; inf: no echo; None: the car has none
+    position_x: Heard | None  # m, in the world's axes; None: the car has no such sensor
+    position_y: Heard | None
+    position_heading: Heard | None  # rad, in ±pi; None: the sensor tells none
     estimate: Estimate
 
 

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Scalar, pytree
@@ -59,7 +58,7 @@ class Straighten:
         del key
         walls: Any = ()
         if self.by == "filter":
-            walls = self.walls.initial_memory(heading=self.bearing, dtype=np.float64)
+            walls = self.walls.initial_memory(heading=self.bearing, dtype=float)
         return Memory(0.0, 0.0, 0.0, self.bearing, 0.0, walls)
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:

@@ -19,7 +19,9 @@ from countersteer.course.files import course_tables
 from countersteer.evaluation.turns import Judge, going_straight, sideslip, summary
 from countersteer.runs.files import COMMANDS, TRUTH
 from countersteer.runs.writer import WHEELS, Rows, RunWriter
+from countersteer.sensing.faults import fault_tables
 from countersteer.simulator import Record, Simulator
+from countersteer.world.floor import floor_tables
 
 COUNTS = ("turn", "wall_contacts")
 TRUTH_PERIOD = 0.005  # s between two rows of truth.csv
@@ -80,7 +82,8 @@ class Log:
         sensors = (r for r in record.readings[1:] if r is not None)
         for reading in (*record.readings.sonar, *sensors):
             new = reading.tick[told] > np.maximum(ticks[told] - plan.telemetry, 0)
-            telemetry.append(np.where(new, reading.value[told], np.nan))
+            values = reading.value[told].reshape(len(told), -1)  # a column each
+            telemetry.extend(np.where(new[:, None], values, np.nan).T)
         echoes = []
         for reading in record.readings.sonar:
             new = np.nonzero((reading.tick == ticks) & (ticks > 0))[0]
@@ -186,7 +189,7 @@ def about_run(simulator: Simulator, driver: str, car: str, laps: int) -> dict[st
             "telemetry_s": plan.telemetry * simulator.dt,
             "truth_s": max(1, round(TRUTH_PERIOD / simulator.dt)) * simulator.dt,
         }
-        | {f"{name}_s": float(ticks) * simulator.dt for name, ticks in sensors.items()},
+        | {f"{name}_s": float(n) * simulator.dt for name, n in sensors.items() if n is not None},
         "link": {
             "name": link.name,
             "delay_s": link.delay,
@@ -207,6 +210,10 @@ def about_run(simulator: Simulator, driver: str, car: str, laps: int) -> dict[st
         about["course"] = course_tables(simulator.course)
     if simulator.start is not None:
         about["start"] = dict(zip(("x_m", "y_m", "heading_rad"), simulator.start, strict=True))
+    if simulator.floor is not None:
+        about["floor"] = floor_tables(simulator.floor)
+    if simulator.faults:
+        about["faults"] = fault_tables(simulator.faults)
     if any(simulator.velocity):
         names = ("vx_mps", "vy_mps", "yaw_rate_radps")
         about["initial"] = dict(zip(names, simulator.velocity, strict=True))
@@ -215,9 +222,12 @@ def about_run(simulator: Simulator, driver: str, car: str, laps: int) -> dict[st
 
 def telemetry_header(simulator: Simulator) -> tuple[str, ...]:
     """Columns of `telemetry.csv` for the car's sensors."""
+    sensors = simulator.car.sensors
+    beams, place = sensors.lidar.beams, sensors.position.reports
+    digits = max(2, len(str(beams - 1)))
     return (
         "time_s",
-        *(f"sonar_{name}_m" for name in simulator.car.sensors.sonar.mount_names),
+        *(f"sonar_{name}_m" for name in sensors.sonar.mount_names),
         "encoder_counts",
         "wheel_speed_mps",
         "gyro_radps",
@@ -225,6 +235,9 @@ def telemetry_header(simulator: Simulator) -> tuple[str, ...]:
         "accel_y_mps2",
         "battery_v",
         *(("line_crossings", "line_speed_mps") if lines_spacing(simulator) else ()),
+        *(f"lidar_{beam:0{digits}}_m" for beam in range(beams)),
+        *(("position_x_m", "position_y_m") if place != "none" else ()),
+        *(("position_heading_rad",) if place == "pose" else ()),
     )
 
 

@@ -14,6 +14,8 @@ from countersteer.car.files import read_toml
 from countersteer.car.parameter import Array, Declaration, changed, declarations, unknown_key
 from countersteer.course.course import Course
 from countersteer.errors import InputError
+from countersteer.world import floor
+from countersteer.world.floor import LARGEST, Floor
 
 LIBRARY = importlib.resources.files("countersteer.evaluation") / "library"
 KINDS = ("within", "plus", "low", "high")
@@ -41,7 +43,7 @@ class Population:
     varied: tuple[Varied, ...]
     charge: tuple[float, float]
     start: tuple[float, float, float]  # most along the line, to its left, and turned
-    floor: tuple[float, float]  # deviation of the friction, relative, and its length (m)
+    floor: tuple[float, float]  # standard deviation of the friction, relative, and its length (m)
 
 
 class Drawn(NamedTuple):
@@ -51,6 +53,7 @@ class Drawn(NamedTuple):
     charge: Array
     pose: Array  # (n, 3) x, y, heading
     speed: Array | None  # that the driver is asked to bring to a turn
+    floor: Floor | None
 
 
 def load_population(name: str) -> Population:
@@ -60,10 +63,10 @@ def load_population(name: str) -> Population:
         if key not in ("description", "vary", "start", "floor"):
             raise unknown_key(where, key, {"vary": 0, "start": 0, "floor": 0})
     varied = tuple(_varied(where, key, entry) for key, entry in tables.get("vary", {}).items())
-    start, floor = tables.get("start", {}), tables.get("floor", {})
+    start, ground = tables.get("start", {}), tables.get("floor", {})
     for table, known in (
         (start, ("charge", *START)),
-        (floor, ("friction", "length_m")),
+        (ground, ("deviation", "length_m")),
     ):
         for key in table:
             if key not in known:
@@ -78,8 +81,8 @@ def load_population(name: str) -> Population:
         factor * _number(where, f"start.{key}", start.get(key, 0.0), 0, 360)
         for key, factor in START.items()
     )
-    deviation = _number(where, "floor.friction", floor.get("friction", 0.0), 0, 0.5)
-    length = _number(where, "floor.length_m", floor.get("length_m", 0.5), 0.01, 100)
+    deviation = _number(where, "floor.deviation", ground.get("deviation", 0.0), 0, LARGEST)
+    length = _number(where, "floor.length_m", ground.get("length_m", 0.5), 0.01, 100)
     along, offset, heading = most
     return Population(name, varied, (low, high), (along, offset, heading), (deviation, length))
 
@@ -163,7 +166,20 @@ def draw(
         pose[:, 0] = x + along * math.cos(heading) - offset * math.sin(heading)
         pose[:, 1] = y + along * math.sin(heading) + offset * math.cos(heading)
         pose[:, 2] = heading + turned
-    return Drawn(cars, charge.astype(dtype), pose.astype(dtype), speed)
+    return Drawn(
+        cars, charge.astype(dtype), pose.astype(dtype), speed, _floors(population, seeds, dtype)
+    )
+
+
+def _floors(population: Population, seeds: Sequence[int], dtype: Any) -> Floor | None:
+    """A floor for each seed; None where it is the same everywhere."""
+    deviation, length = population.floor
+    if deviation == 0:
+        return None
+    keys = jax.vmap(jax.random.key)(np.asarray(seeds, np.int32))
+    drawn = jax.jit(jax.vmap(lambda key: floor.draw(key, deviation, length)))(keys)
+    cast: Floor = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), drawn)
+    return cast
 
 
 def _between(ends: tuple[float, float], even: Array) -> Array:

@@ -33,6 +33,7 @@ from countersteer.evaluation.turns import (
 from countersteer.sensing import sonar
 from countersteer.simulator import Loop, Plan, Simulator, Surroundings, begin, padded, tick
 from countersteer.world import planar
+from countersteer.world.floor import Floor
 from countersteer.world.state import State
 
 LANES = 128  # trials of a block
@@ -194,6 +195,7 @@ class Trials(NamedTuple):
     driver: Any  # leaves that all trials share have no such axis
     charge: Array
     pose: Array  # (n, 3)
+    floor: Floor | None
     seed: Array
 
 
@@ -235,7 +237,7 @@ def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> Score:
     """One trial of at most so many ticks; a block goes on until all its trials are over."""
     every = max(1, round(LOOK / plan.dt))
     key, driver_key = jax.random.split(jax.random.key(own.seed))
-    around = Surroundings(shared.walls, shared.corners, key, shared.loss, shared.nominal)
+    around = Surroundings(shared.walls, shared.corners, key, shared.loss, shared.nominal, own.floor)
     zero = jnp.zeros_like(own.charge)
     pose = (own.pose[0], own.pose[1], own.pose[2])
     still = (zero, zero, zero)
@@ -305,7 +307,9 @@ def rollouts(
         start,
     )
     common, own = _common(drivers, dtype)
-    varied = Trials(drawn.cars, own, drawn.charge, drawn.pose, np.asarray(seeds, np.int32))
+    varied = Trials(
+        drawn.cars, own, drawn.charge, drawn.pose, drawn.floor, np.asarray(seeds, np.int32)
+    )
     mesh = Mesh(np.array(jax.devices()), ("core",))
     width = lanes * mesh.size
     ticks = round(longest / simulator.dt)

@@ -8,6 +8,7 @@
 | `/pose`, `/path` | foxglove.PoseInFrame, PosesInFrame | where the car is, and was so far |
 | `/course`, `/car` | foxglove.SceneUpdate | walls as lines; the car, fixed to its frames; once |
 | `/sonar/<mount>` | foxglove.LaserScan | each reading of a sonar as an arc over its cone |
+| `/lidar` | foxglove.LaserScan | each reading of a lidar, its beams evenly over its field |
 
 A message of a table has the table's columns, with the very digits of the CSV file. A column is
 absent where its cell is empty. JSON has no word for infinity, so no echo is the number 1e999, which
@@ -213,6 +214,13 @@ class _Scene:
             for name in sonar.mount_names
             if f"sonar_{name}_m" in telemetry
         ]
+        lidar = car.sensors.lidar
+        beams = [i for i, name in enumerate(telemetry) if name.startswith("lidar_")]
+        self._beams: list[int] = beams if 0 < len(beams) == lidar.beams else []
+        if self._beams:
+            self._mounts.append(("car", "lidar", lidar.x, lidar.y, 0.0, lidar.angle))
+            self._half_field = float(lidar.field) / 2 * (1 - 1 / lidar.beams)
+            self._lidar = channels.LaserScanChannel("/lidar", context=context).log
         walls = about.get("course", {}).get("walls_m", [])
         if walls:
             scene = messages.SceneUpdate(entities=[_course(walls)])
@@ -237,7 +245,11 @@ class _Scene:
         for row in tables.get("telemetry", ()):
             for column, frame, log in self._sonars:
                 if row[column]:
-                    yield self._scan(float(row[0]), frame, log, float(row[column]))
+                    ranges = [float(row[column])] * BEAMS
+                    yield _scan(float(row[0]), frame, log, ranges, self._half_angle)
+            if self._beams and row[self._beams[0]]:
+                ranges = [float(row[i]) for i in self._beams]
+                yield _scan(float(row[0]), "lidar", self._lidar, ranges, self._half_field)
 
     def _moved(
         self, time: float, x: float, y: float, heading: float, steering: float
@@ -274,17 +286,21 @@ class _Scene:
             path = messages.PosesInFrame(timestamp=stamp, frame_id="world", poses=thinned)
             yield at, self._path, path
 
-    def _scan(self, time: float, frame: str, log: Callable[..., None], distance: float) -> Timed:
-        scan = messages.LaserScan(
-            timestamp=timestamp(time),
-            frame_id=frame,
-            pose=messages.Pose(position=messages.Vector3(), orientation=LEVEL),
-            start_angle=-self._half_angle,
-            end_angle=self._half_angle,
-            ranges=[distance] * BEAMS,
-            intensities=[1.0] * BEAMS,
-        )
-        return nanoseconds(time), log, scan
+
+def _scan(
+    time: float, frame: str, log: Callable[..., None], ranges: list[float], half: float
+) -> Timed:
+    """Distances evenly over so much (rad) to either side of a frame's x axis, right to left."""
+    scan = messages.LaserScan(
+        timestamp=timestamp(time),
+        frame_id=frame,
+        pose=messages.Pose(position=messages.Vector3(), orientation=LEVEL),
+        start_angle=-half,
+        end_angle=half,
+        ranges=ranges,
+        intensities=[1.0] * len(ranges),
+    )
+    return nanoseconds(time), log, scan
 
 
 def _course(walls: Sequence[Sequence[float]]) -> messages.SceneEntity:

@@ -1,9 +1,17 @@
-"""Parts that read a number now and then: encoder, gyroscope, accelerometer, voltmeter, lines."""
+"""Parts that read a number now and then: encoder, gyroscope, accelerometer and so on."""
 
 import jax
 import jax.numpy as jnp
 
-from countersteer.car.car import Accelerometer, Encoder, Gyroscope, LineDetector, Voltmeter, Wheels
+from countersteer.car.car import (
+    Accelerometer,
+    Encoder,
+    Gyroscope,
+    LineDetector,
+    Position,
+    Voltmeter,
+    Wheels,
+)
 from countersteer.car.parameter import Scalar
 
 
@@ -47,6 +55,17 @@ def accelerometer(
 def voltmeter(part: Voltmeter, voltage: Scalar, noise: Scalar) -> Scalar:
     """A reading (V), given a standard normal number."""
     return quantised(voltage + part.noise * noise, part.resolution)
+
+
+def position(part: Position, pose: jax.Array, noise: jax.Array) -> tuple[Scalar, Scalar, Scalar]:
+    """Readings of x, y (m) and heading (rad, in ±pi), given three standard normal numbers."""
+    heading = pose[2] + part.heading_noise * noise[2]
+    turns = jnp.round(heading / (2 * jnp.pi))
+    return (
+        pose[0] + part.noise * noise[0],
+        pose[1] + part.noise * noise[1],
+        heading - 2 * jnp.pi * turns,
+    )
 
 
 def eye(part: LineDetector, x: Scalar, heading: Scalar) -> Scalar:

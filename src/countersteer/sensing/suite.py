@@ -1,17 +1,19 @@
 """All sensors of a car on the shared clock."""
 
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Scalar
-from countersteer.sensing import parts, sonar
+from countersteer.car.parameter import Array, Scalar
+from countersteer.sensing import lidar, parts, sonar
 from countersteer.world import drivetrain, motor
 from countersteer.world.state import Motion
+
+POSITION = ("position_x", "position_y", "position_heading")
 
 
 class Reading(NamedTuple):
@@ -33,6 +35,10 @@ class Readings(NamedTuple):
     battery: Reading  # V
     line_crossings: Reading | None = None  # lines entered since the start; None: no line detector
     line_speed: Reading | None = None  # m/s, their spacing over the time since the last one
+    lidar: Reading | None = None  # (beams,), m, from right to left; inf: no echo; None: no lidar
+    position_x: Reading | None = None  # m; None: no such sensor
+    position_y: Reading | None = None
+    position_heading: Reading | None = None  # rad; None: the sensor tells no heading
 
 
 class Periods(NamedTuple):
@@ -43,6 +49,8 @@ class Periods(NamedTuple):
     gyroscope: Fraction
     accelerometer: Fraction
     voltmeter: Fraction
+    lidar: Fraction | None = None  # None: the car has none
+    position: Fraction | None = None
 
 
 def number(every: Fraction, tick: Scalar) -> Scalar:
@@ -65,6 +73,7 @@ class Memory(NamedTuple):
     vx: Scalar  # at the accelerometer's last report
     vy: Scalar
     eye: Scalar | None  # place of the line detector's eye (m)
+    poses: Array | None = None  # (delay in ticks + 1, 3), a slot a tick: what position is to tell
 
 
 def periods(car: Car, dt: float) -> Periods:
@@ -76,22 +85,38 @@ def periods(car: Car, dt: float) -> Periods:
         1 / sensors.gyroscope.rate,
         1 / sensors.accelerometer.rate,
         1 / sensors.voltmeter.rate,
+        1 / sensors.lidar.rate if sensors.lidar.beams else None,
+        1 / sensors.position.rate if sensors.position.reports != "none" else None,
     )
-    ticks = (Fraction(float(time) / dt).limit_denominator(100) for time in times)
-    return Periods(*(max(Fraction(1), period) for period in ticks))
+
+    def period(time: Scalar) -> Fraction:
+        return max(Fraction(1), Fraction(float(time) / dt).limit_denominator(100))
+
+    found: list[Any] = [None if time is None else period(time) for time in times]
+    return Periods(*found)
 
 
-def initial_memory(car: Car, motion: Motion) -> Memory:
+def initial_memory(car: Car, motion: Motion, dt: float) -> Memory:
     """Sensors that have not reported yet."""
     dtype = jnp.result_type(motion.x).type
     zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
     no_echo = none._replace(value=dtype(np.inf))
-    readings = Readings(tuple(no_echo for _ in car.sensors.sonar.mounts), *[none] * 6)
-    eye, part = None, car.sensors.line_detector
+    sensors = car.sensors
+    readings = Readings(tuple(no_echo for _ in sensors.sonar.mounts), *[none] * 6)
+    eye, poses, part = None, None, sensors.line_detector
     if part.lines != "none":
         readings = readings._replace(line_crossings=none, line_speed=none)
         eye = parts.eye(part, motion.x, motion.heading)
-    return Memory(readings, zero, zero, zero, motion.vx, motion.vy, eye)
+    if sensors.lidar.beams:
+        silent = np.full(sensors.lidar.beams, np.inf, dtype)
+        readings = readings._replace(lidar=none._replace(value=silent))
+    if sensors.position.reports != "none":
+        readings = readings._replace(position_x=none, position_y=none)
+        if sensors.position.reports == "pose":
+            readings = readings._replace(position_heading=none)
+        pose = np.array([motion.x, motion.y, motion.heading], dtype)
+        poses = np.tile(pose, (round(float(np.max(sensors.position.delay)) / dt) + 1, 1))
+    return Memory(readings, zero, zero, zero, motion.vx, motion.vy, eye, poses)
 
 
 def sense(
@@ -168,6 +193,25 @@ def sense(
             battery=Reading(parts.voltmeter(sensors.voltmeter, voltage, noise), tick)
         )
 
+    def scan(readings: Readings) -> Readings:
+        pose = (motion.x, motion.y, motion.heading)
+        noise = jax.random.normal(jax.random.fold_in(key, 5), (sensors.lidar.beams,), dtype)
+        return readings._replace(
+            lidar=Reading(lidar.ranges(sensors.lidar, walls, pose, noise), tick)
+        )
+
+    def locate(readings: Readings) -> Readings:
+        noise = jax.random.normal(jax.random.fold_in(key, 6), (3,), dtype)
+        assert memory.poses is not None
+        told = parts.position(sensors.position, memory.poses[(tick + 1) % len(memory.poses)], noise)
+        return readings._replace(
+            **{
+                name: Reading(value, tick)
+                for name, value in zip(POSITION, told, strict=True)
+                if getattr(readings, name) is not None
+            }
+        )
+
     counted, weighed = due(every.encoder, tick), due(every.accelerometer, tick)
     reports = [
         (due(every.gyroscope, tick), turn),
@@ -177,6 +221,13 @@ def sense(
     ]
     if sensors.sonar.mounts:
         reports.append((due(every.sonar, tick), ping))
+    if every.lidar is not None:
+        reports.append((due(every.lidar, tick), scan))
+    if every.position is not None and memory.poses is not None:
+        slots = len(memory.poses)
+        pose = jnp.stack([motion.x, motion.y, motion.heading])
+        memory = memory._replace(poses=memory.poses.at[tick % slots].set(pose))
+        reports.append((due(every.position, tick) & (tick >= slots - 1), locate))
     for now, report in reports:
         readings = jax.lax.cond(now, report, lambda same: same, readings)
     if memory.eye is not None:

@@ -33,3 +33,17 @@ def cosine_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
         jnp.where(((count + 1) & 2) == 0, cosine, -cosine),
         jnp.where((count & 2) == 0, sine, -sine),
     )
+
+
+def cosine(angle: Scalar) -> Scalar:
+    """The cosine alone of an angle (rad), for a third of the work; to rounding within a few turns.
+
+    1 - 2 sin²(half the angle), once whole turns are taken off: Taylor's series up to a quarter.
+    """
+    terms = 10 if jnp.result_type(angle) == jnp.float64 else 6
+    turns = angle * (1 / (2 * math.pi))
+    half = math.pi * (turns - jnp.round(turns))
+    sine: Scalar = 0.0
+    for k in reversed(range(terms)):
+        sine = (-1) ** k / math.factorial(2 * k + 1) + sine * half**2
+    return 1 - 2 * (half * sine) ** 2

@@ -36,6 +36,7 @@ from countersteer.car.parameter import Array, Scalar
 from countersteer.world import battery, chassis, drivetrain, motor, servo, tyre, walls
 from countersteer.world.angle import cosine_sine
 from countersteer.world.chassis import Symmetric, Vector, combine, dot, times
+from countersteer.world.floor import Floor, under_wheels
 from countersteer.world.state import Motion, State
 
 ROLL_OVER_TIME = 0.1  # s that a pair of wheels is in the air until the car counts as rolled over
@@ -61,6 +62,7 @@ class Tick(NamedTuple):
     asked: Command  # as it reaches motor and servo, after their delays
     count: Scalar  # ticks since the start, an integer
     dt: float
+    floor: Floor | None = None  # None: the same friction everywhere
 
 
 def initial_state(
@@ -106,14 +108,27 @@ def tires_by_wheel(car: Car) -> Wheels:
     return Wheels(front, front, rear, rear)
 
 
+def tires_on(car: Car, friction: Wheels | None) -> Wheels:
+    """The tyre on each wheel, with its friction on the floor under it."""
+    tires = tires_by_wheel(car)
+    return tires if friction is None else Wheels(*map(tyre.scaled, tires, friction))
+
+
 def step(
-    car: Car, around: jax.Array, state: State, command: Command, count: Scalar, dt: float
+    car: Car,
+    around: jax.Array,
+    state: State,
+    command: Command,
+    count: Scalar,
+    dt: float,
+    floor: Floor | None = None,
 ) -> State:
     """One tick of dt seconds. Pure; works under `jit`, `vmap` (the count unbatched) and `grad`.
 
-    Throttle in [-1, 1], steering in rad. Precision is that of the car's leaves.
+    Throttle in [-1, 1], steering in rad. Precision is that of the car's leaves. Without a `floor`
+    friction is the same everywhere, and nothing is computed for it.
     """
-    tick = Tick(car, around, command, command, count, dt)
+    tick = Tick(car, around, command, command, count, dt, floor)
     for stage in STAGES:
         state, tick = stage(state, tick)
     return state
@@ -156,7 +171,8 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
         servo.target(car.servo, tick.asked.steering),
     )
     velocity = Vector(start.vx, start.vy, start.yaw_rate)
-    at_start = grip(car, start)
+    friction = under_wheels(tick.floor, car.body, start, h / 2)
+    at_start = grip(car, start, friction)
     ahead, wheels = implicit(car, at_start, TANGENT, velocity, start.wheels, h / 2)
     middle = loaded(
         car, follow(car, start, goal, h / 2), start, combine(1.0, ahead, -1.0, velocity), h / 2
@@ -164,7 +180,7 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
     ahead = rotated(ahead, h / 2 * start.yaw_rate)
     middle = middle._replace(vx=ahead.x, vy=ahead.y, yaw_rate=ahead.yaw, wheels=wheels)
 
-    held = grip(car, middle)
+    held = grip(car, middle, friction)
     before = rotated(velocity, h / 2 * start.yaw_rate)  # in the axes of the tick's middle
     lean = Wheels(*(w * (1 - state.wary) for w in steady(at_start, held)))
     after, wheels = two_stages(car, held, lean, before, start.wheels, h)
@@ -294,15 +310,15 @@ class Grip(NamedTuple):
 
 
 @jax.jit
-def grip(car: Car, motion: Motion) -> Grip:
-    """Contacts, drag and drive at an instant."""
+def grip(car: Car, motion: Motion, friction: Wheels | None = None) -> Grip:
+    """Contacts, drag and drive at an instant; `friction` is that of the floor over the tyres'."""
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
     steered = Steered(*servo.directions(car.body, car.servo, motion.steering))
     rolls, slides = contact_directions(car, steered)
     loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
     found = []
     for tire, load, speed, roll, slide in zip(
-        tires_by_wheel(car), loads, motion.wheels, rolls, slides, strict=True
+        tires_on(car, friction), loads, motion.wheels, rolls, slides, strict=True
     ):
         rim = tire.radius * speed
         found.append(tyre.contact(tire, load, dot(roll, velocity) - rim, dot(slide, velocity), rim))
@@ -450,9 +466,10 @@ class Forces(NamedTuple):
     angle: Scalar  # of the wheel, rad
 
 
-def forces(car: Car, motion: Motion) -> Wheels:
+def forces(car: Car, motion: Motion, floor: Floor | None = None) -> Wheels:
     """The four contacts' forces at an instant."""
-    held = grip(car, motion)
+    friction = under_wheels(floor, car.body, motion)
+    held = grip(car, motion, friction)
     rolls, _ = contact_directions(car, held.steered)
     loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
     return Wheels(
@@ -465,7 +482,7 @@ def forces(car: Car, motion: Motion) -> Wheels:
                 jnp.arctan2(roll.y, roll.x),
             )
             for tire, load, roll, c in zip(
-                tires_by_wheel(car), loads, rolls, held.contacts, strict=True
+                tires_on(car, friction), loads, rolls, held.contacts, strict=True
             )
         )
     )

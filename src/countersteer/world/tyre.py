@@ -1,5 +1,6 @@
 """Tyres: the force of a contact at its slip, with the stiffness that an implicit step follows."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -148,6 +149,15 @@ def magic_forces(
     force_x = pure_x * loss(steep_x, m.r_cx1, m.r_ex1, angle, shifts * m.r_hx1)
     force_y = pure_y * loss(steep_y, m.r_cy1, m.r_ey1, slip, shifts * m.r_hy1)
     return load * force_x, load * (force_y + shifts * m.p_dy1 * by_slip)
+
+
+def scaled(tire: Tire, friction: Scalar) -> Tire:
+    """The tyre on a floor of so many times the friction; its stiffnesses stay what they are."""
+    if tire.law == "magic-formula":
+        m = tire.magic_formula
+        peaks = {"p_dx1": friction * m.p_dx1, "p_dy1": friction * m.p_dy1}
+        return dataclasses.replace(tire, magic_formula=dataclasses.replace(m, **peaks))
+    return dataclasses.replace(tire, friction=friction * tire.friction)
 
 
 def limit(tire: Tire, load: Scalar) -> Scalar:

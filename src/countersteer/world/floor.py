@@ -1,0 +1,96 @@
+"""The floor: friction that varies from place to place, as a sum of waves."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.car import Body, Wheels, wheel_positions
+from countersteer.car.parameter import Scalar
+from countersteer.errors import InputError
+from countersteer.world.angle import cosine, cosine_sine
+from countersteer.world.state import Motion
+
+KEYS = ("x_radpm", "y_radpm", "phase_rad")  # of a wave in files
+WAVES = 8
+LARGEST = 0.95 / math.sqrt(2 * WAVES)  # deviation up to which no place is without friction
+
+
+class Wave(NamedTuple):
+    """One wave over the floor."""
+
+    x: Scalar  # wave vector, rad/m
+    y: Scalar
+    phase: Scalar  # at the origin, rad
+
+
+class Floor(NamedTuple):
+    """Friction over that of the tyres at a place p: 1 + amplitude · Σ cos(wave · p + phase)."""
+
+    waves: tuple[Wave, ...]
+    amplitude: Scalar
+
+
+def draw(key: jax.Array, deviation: Scalar = 0.1, length: Scalar = 0.5) -> Floor:
+    """A floor at random, whose friction deviates by so much (1) over so many metres.
+
+    It is close to a Gaussian field: the mean is 1, the standard deviation as given, and over a
+    distance d the correlation is exp(-d²/2 length²), each over all draws. It never leaves
+    1 ± deviation sqrt(2 WAVES), which is above 0 for a deviation of at most `LARGEST`.
+
+    Source: A. Rahimi and B. Recht, Random features for large-scale kernel machines, NIPS 2007. The
+    directions of the waves are spread evenly, so that a single draw is alike along all of them.
+    """
+    radius, direction, phase = jax.random.uniform(key, (3, WAVES), jnp.result_type(float))
+    number = jnp.sqrt(-2 * jnp.log1p(-radius)) / length  # of a Gaussian vector in the plane
+    angle = jnp.pi * (jnp.arange(WAVES) + direction) / WAVES
+    parts = number * jnp.cos(angle), number * jnp.sin(angle), 2 * jnp.pi * phase
+    waves = tuple(Wave(*(part[i] for part in parts)) for i in range(WAVES))
+    return Floor(waves, deviation * math.sqrt(2 / WAVES))
+
+
+def friction(floor: Floor, x: Scalar, y: Scalar) -> Scalar:
+    """Friction at a place (m), over that of the tyres."""
+    total = sum(cosine(w.x * x + w.y * y + w.phase) for w in floor.waves)
+    return 1 + floor.amplitude * total
+
+
+def under_wheels(
+    floor: Floor | None, body: Body, motion: Motion, time: Scalar = 0.0
+) -> Wheels | None:
+    """`friction` at each contact so long (s) after an instant; None without a floor."""
+    if floor is None:
+        return None
+    angle = motion.heading + time * motion.yaw_rate
+    c, s = cosine_sine(angle)
+    places = (
+        (ahead + time * motion.vx, left + time * motion.vy)
+        for ahead, left in zip(*wheel_positions(body), strict=True)
+    )
+    return Wheels(
+        *(
+            friction(floor, motion.x + c * ahead - s * left, motion.y + s * ahead + c * left)
+            for ahead, left in places
+        )
+    )
+
+
+def floor_tables(floor: Floor) -> dict[str, Any]:
+    """A floor as plain data, for `run.toml`."""
+    waves = [dict(zip(KEYS, map(float, wave), strict=True)) for wave in floor.waves]
+    return {"amplitude": float(floor.amplitude), "waves": waves}
+
+
+def floor_of_run(about: Mapping[str, Any]) -> Floor | None:
+    """The floor of a `run.toml`, if it was not the same everywhere. Raises `InputError`."""
+    tables = about.get("floor")
+    if tables is None:
+        return None
+    try:
+        waves = tuple(Wave(*(np.float64(wave[key]) for key in KEYS)) for wave in tables["waves"])
+        return Floor(waves, np.float64(tables["amplitude"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"run.toml: [floor] is not as it was written: {error}") from None
