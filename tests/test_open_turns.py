@@ -21,7 +21,7 @@ from countersteer.evaluation.open_turns import (
     trial,
     write_rows,
 )
-from countersteer.learning.stop_angle import learn_stop_angle
+from countersteer.evaluation.stop_regression import regress_stops
 
 TIME = np.arange(0, 3, 0.005)
 LANES = 32
@@ -151,7 +151,7 @@ def test_one_line_has_one_region():
 def test_what_is_learned_predicts_turns_that_were_not_seen(turns):
     table = as_table(turns)
     half = np.arange(len(turns)) % 2 == 0
-    learned = learn_stop_angle(type(table)({k: v[half] for k, v in table.items()}))
+    learned = regress_stops(type(table)({k: v[half] for k, v in table.items()}))
     new = ~half & (table["angle_to_stop_deg"] < 30)
     v, r = table["kill_speed_mps"][new], np.radians(table["kill_yaw_rate_degps"][new])
     angle = np.radians(table["angle_to_stop_deg"][new])

@@ -836,23 +836,20 @@ def run_turns(options: argparse.Namespace) -> int:
 
 def run_learn_stop_angle(options: argparse.Namespace) -> int:
     """`learn stop-angle`."""
-    from countersteer.drivers.policy import save_policy
-    from countersteer.learning import stop_angle
+    from countersteer.evaluation import stop_regression
+    from countersteer.learning.stop_angle import learn
 
     if options.out.suffix != ".toml":
         raise InputError(f"--out {options.out}: name a .toml file")
-    table = stop_angle.read_all(options.sources)
-    learned = stop_angle.learn_stop_angle(table, math.radians(options.most_deg))
-    names = [path.name for path in options.sources]
-    save_policy(options.out, stop_angle.source(learned, names), stop_angle=learned.stop_angle)
-    result, picture = stop_angle.about(learned), options.out.with_suffix(".png")
+    found = learn(options.sources, math.radians(options.most_deg), options.out)
+    result, picture = stop_regression.about(found), options.out.with_suffix(".png")
     options.out.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    stop_angle.draw(learned, picture, f"{len(learned.rate)} turns of {', '.join(names)}"[:90])
+    names = ", ".join(path.name for path in options.sources)
+    stop_regression.draw(found, picture, f"{result['turns']} turns of {names}"[:90])
     if options.json:
         print(json.dumps(result | {"policy": str(options.out), "picture": str(picture)}))
         return DONE
-    for line in stop_angle.lines(result):
-        print(line)
+    print("\n".join(stop_regression.lines(result)))
     print(f"policy: {options.out}; picture: {picture}")
     return DONE
 

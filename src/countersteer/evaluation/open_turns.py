@@ -16,7 +16,7 @@ from countersteer.car.car import Car
 from countersteer.drivers.open_turn import open_turn
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
-from countersteer.evaluation.floor import drives
+from countersteer.evaluation.open_drives import batch, drives
 from countersteer.evaluation.population import Population, draw
 from countersteer.evaluation.turns import sideslip
 from countersteer.runs.files import Table, read_table
@@ -153,13 +153,11 @@ def trial(
     where there is a population. The driver knows the nominal car.
     """
     count = len(seeds)
-    cars, charges = car, np.ones(count)
+    cars, charges, floor = batch(car, count), np.ones(count), None
     drawn = np.array([np.random.default_rng([seed, 1]).uniform(size=5) for seed in seeds])
     if population is not None:
         varied = draw(population, car, None, seeds, np.float32)
-        cars, charges = varied.cars, varied.charge
-    else:
-        cars = batch(car, count)
+        cars, charges, floor = varied.cars, varied.charge, varied.floor
     if charge is not None:
         charges = charge[0] + (charge[1] - charge[0]) * drawn[:, 0]
     entry = speeds[0] + (speeds[1] - speeds[0]) * drawn[:, 1]
@@ -172,7 +170,16 @@ def trial(
         for v, h, k, t in zip(entry, hand, kill, longest, strict=True)
     ]
     velocity = np.stack([entry, np.zeros(count), np.zeros(count)], axis=1)
-    sampled = drives(cars, charges.astype(np.float32), drivers, velocity, RUN_TIME, report, lanes)
+    sampled = drives(
+        cars,
+        charges.astype(np.float32),
+        drivers,
+        velocity,
+        RUN_TIME,
+        floor=floor,
+        report=report,
+        lanes=lanes,
+    )
     rows = []
     for i, seed in enumerate(seeds):
         m, c = sampled.motion, sampled.command
@@ -180,13 +187,6 @@ def trial(
         for stop in stops(Series(sampled.time, *series))[:1]:
             rows.append(row(stop, float(charges[i]), int(seed)))
     return rows
-
-
-def batch(car: Car, count: int) -> Car:
-    """So many of one car, in 32 bits."""
-    import jax
-
-    return jax.tree.map(lambda leaf: np.broadcast_to(np.float32(leaf), (count,)), car)
 
 
 def series_of(run: Run) -> Series:
