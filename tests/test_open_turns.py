@@ -62,7 +62,8 @@ def test_a_stop_that_is_broken_off_or_too_slow_or_never_comes_is_none():
 def write_run(folder: Path, series: Series, truth: bool) -> Path:
     folder.mkdir()
     (folder / "run.toml").write_text("battery_charge = 0.7\n")
-    lines = [f"{t:.3f},{u:g},forward,0" for t, u in zip(TIME, series.throttle, strict=True)]
+    told = zip(TIME, series.throttle, np.degrees(series.steering), strict=True)
+    lines = [f"{t:.3f},{u:g},forward,{angle:.6f}" for t, u, angle in told]
     (folder / "commands.csv").write_text(
         "\n".join(["time_s,throttle,direction,steering_deg", *lines]) + "\n"
     )

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 DRIVERS = ("drift-turn", "straighten")
+EXPERIMENTS = (
+    "turn-rate", "drift-threshold", "stop-time", "drift-turn", "control-rate", "battery",
+    "narrowest-corner",
+)  # fmt: skip
 LONGEST_REPLAY = 3600.0  # s
 FASTEST_GIF = 50  # frames a second
 
@@ -297,6 +301,22 @@ def parser() -> Parser:
         metavar="RUN",
         help="find the turns in these runs' folders instead, of a real car or a simulated one",
     )
+
+    experiment = verb("experiment", "the paper's measurements", run_experiment)
+    experiment.add_argument(
+        "name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS)
+    )
+    nominal_car(experiment)
+    experiment.add_argument(
+        "--from",
+        dest="runs",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUN",
+        help="measure in these runs' folders instead, of a real car or a simulated one",
+    )
+    experiment.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
 
     learn = group("learn", "experience to a driver's numbers", "METHOD")
     stop = learn(
@@ -831,6 +851,34 @@ def run_turns(options: argparse.Namespace) -> int:
         if ends:
             print(f"  {name:20}" + "".join(f"{ends[k]:10.2f}" for k in ("low", "median", "high")))
     print(f"table: {folder / 'turns.csv'}; picture: {folder / 'turns.png'}")
+    return DONE
+
+
+def run_experiment(options: argparse.Namespace) -> int:
+    """`experiment`."""
+    from countersteer.car.files import load_car
+    from countersteer.evaluation import experiments
+    from countersteer.evaluation.experiments.found import write
+    from countersteer.runs.run import read_run
+    from countersteer.runs.writer import new_folder
+    from countersteer.simulator import keep_programs
+
+    # Only the closed loop is worth its time in a compiler that makes a function of it.
+    keep_programs(blocks=options.name == "control-rate", cores=os.cpu_count() or 1)
+    module, car = experiments.load(options.name), load_car(options.car, options.set)
+    if options.runs and not hasattr(module, "measure"):
+        raise InputError(f"--from: {options.name} is simulated, and measures no run")
+    with Progress(options.json) as progress:
+        if options.runs:
+            found = module.measure([read_run(path) for path in options.runs])
+        else:
+            found = module.simulate(car, Path(options.car).stem, progress.show)
+    folder = new_folder(options.out, options.name)
+    result = write(found, folder, options.name)
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+    else:
+        print(f"{found.text}\ntable, picture: {folder}")
     return DONE
 
 

@@ -9,8 +9,7 @@ used: with the lines interpolated between the regions' medians of v.
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -143,27 +142,23 @@ def in_regions(lines: Sequence[Line], v: np.ndarray) -> np.ndarray:
     return np.searchsorted([line.low for line in lines[1:]], v, side="right")
 
 
-def draw_stops(
+def paint_stops(
+    figure: Any,
     time: Sequence[Line],
     angle: Sequence[Line],
     speed: np.ndarray,
     rate: np.ndarray,
     times: np.ndarray,
     angles: np.ndarray,
-    path: Path,
-    title: str,
 ) -> None:
-    """A picture: time and angle to the stop over the yaw rate, a colour and a line a region.
+    """Time and angle to the stop over the yaw rate, a colour and a line a region.
 
     SI units and rad; drawn in degrees.
     """
     import matplotlib
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharex=True)
-    colours = plt.get_cmap("viridis")(np.linspace(0.0, 0.85, len(angle)))
+    axes = figure.subplots(1, 2, sharex=True)
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.85, len(angle)))
     region = in_regions(angle, speed)
     for ax, lines, values, factor, label in (
         (axes[0], time, times, 1.0, "time to stop, s"),
@@ -172,18 +167,14 @@ def draw_stops(
         for number, (line, colour) in enumerate(zip(lines, colours, strict=True)):
             own = region == number
             span = np.array([rate[own].min(), rate[own].max()])
-            name = f"{line.low:.2f} to {line.high:.2f} m/s ({line.points})"
-            ax.scatter(
-                np.degrees(rate[own]), factor * values[own], s=8, color=colour, alpha=0.4,
-                linewidths=0,
-            )  # fmt: skip
+            ax.plot(np.degrees(rate[own]), factor * values[own], ".", color=colour, ms=4, alpha=0.4)
             ax.plot(
-                np.degrees(span), factor * (line.offset + line.slope * span), color=colour,
-                linewidth=2, label=name,
-            )  # fmt: skip
+                np.degrees(span),
+                factor * (line.offset + line.slope * span),
+                color=colour,
+                lw=2,
+                label=f"{line.low:.2f} to {line.high:.2f} m/s ({line.points})",
+            )
         ax.set_xlabel("yaw rate at the kill, °/s")
         ax.set_ylabel(label)
     axes[1].legend(frameon=False, fontsize=8, title="forward speed", title_fontsize=8)
-    figure.suptitle(title)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)

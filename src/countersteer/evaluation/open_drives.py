@@ -18,6 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 from countersteer.car.car import Car
 from countersteer.car.parameter import Array
 from countersteer.drivers.driver import Command, Driver, Heard, Observation
+from countersteer.drivers.replay import Replay
 from countersteer.estimation.estimate import Estimate
 from countersteer.evaluation.rollout import LANES, LOOK
 from countersteer.simulator import padded
@@ -27,6 +28,7 @@ from countersteer.world.state import Motion, State
 
 PIECE = 100  # samples of a call, whatever the length of the drives
 DT = 0.001  # s
+STEPS = 4
 NOTHING = Heard(math.nan, math.inf)
 
 
@@ -156,6 +158,13 @@ def _on_cores(mesh: Mesh, run: Callable[..., Any], inputs: Any) -> Callable[...,
         run, mesh=mesh, in_specs=inputs, out_specs=PartitionSpec("core"), check_vma=False
     )
     return made
+
+
+def commands(*steps: tuple[float, float, float]) -> Replay:
+    """Open-loop commands of up to `STEPS` steps: time, throttle, steering (rad)."""
+    # As many for all, so that they share a program.
+    padded = np.array([*steps, *[steps[-1]] * (STEPS - len(steps))]).T
+    return Replay(times=padded[0], throttle=padded[1], steering=padded[2])
 
 
 def batch(car: Car, count: int) -> Car:

@@ -75,8 +75,8 @@ class Stop(NamedTuple):
     peak_sideslip: float  # NaN where nothing tells it
 
 
-def stops(series: Series) -> list[Stop]:
-    """The turns of a drive that were stopped, and came to a stop undisturbed."""
+def stops(series: Series, undisturbed: bool = True) -> list[Stop]:
+    """The turns that were stopped, and came to a stop: `undisturbed` by throttle until then."""
     time, rate = series.time, series.yaw_rate
     drives = series.throttle > ON
     held = np.abs(series.throttle) <= OFF
@@ -85,7 +85,7 @@ def stops(series: Series) -> list[Stop]:
         if not abs(rate[kill]) > FAST or not series.vx[kill] > SLOWEST:
             continue
         hand = int(np.sign(rate[kill]))
-        again = np.nonzero(~held[kill:])[0]
+        again = np.nonzero(~held[kill:])[0] if undisturbed else np.zeros(0, int)
         last = min(
             kill + (int(again[0]) if len(again) else len(time)),
             int(np.searchsorted(time, time[kill] + LONGEST)),

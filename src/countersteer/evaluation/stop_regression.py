@@ -18,8 +18,8 @@ from countersteer.evaluation.local_regression import (
     Line,
     Local,
     bounds_of,
-    draw_stops,
     fit,
+    paint_stops,
     regress,
 )
 from countersteer.runs.files import Table
@@ -36,6 +36,7 @@ class Stops(NamedTuple):
     rate: np.ndarray
     angles: np.ndarray
     times: np.ndarray
+    most: float  # that a turn may have gone on for
     ran_on: int  # turns left out
     ran_on_from: float  # least yaw rate at which one ran on
 
@@ -70,6 +71,7 @@ def regress_stops(table: Table, most: float = MOST) -> Stops:
         rate[stopped],
         angle[stopped],
         times,
+        most,
         int(np.sum(~stopped)),
         float(np.min(rate[~stopped], initial=math.inf)),
     )
@@ -139,15 +141,28 @@ def lines(told: dict[str, Any]) -> list[str]:
     return text
 
 
-def draw(found: Stops, path: Path, title: str) -> None:
-    """Picture: the turns with the lines through them, by region."""
-    draw_stops(
+def paint(found: Stops, figure: Any) -> None:
+    """The turns with the lines through them, by region."""
+    paint_stops(
+        figure,
         found.time,
         found.angle.lines,
         found.speed,
         found.rate,
         found.times,
         found.angles,
-        path,
-        title,
     )
+
+
+def draw(found: Stops, path: Path, title: str) -> None:
+    """Picture of the same."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(10, 4), layout="constrained")
+    paint(found, figure)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
