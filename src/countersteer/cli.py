@@ -87,7 +87,7 @@ def parser() -> Parser:
     def group(name: str, does: str, metavar: str) -> Callable[..., Parser]:
         """A verb of several things, each with options of its own."""
         made = verbs.add_parser(name, help=does, description=does)
-        kinds = made.add_subparsers(dest="what", metavar=metavar, required=True)
+        kinds = made.add_subparsers(dest="what", metavar=metavar, required=True, help=does)
 
         def kind(name: str, does: str, run: Callable[[argparse.Namespace], int]) -> Parser:
             part: Parser = kinds.add_parser(name, help=does, description=does)
