@@ -176,8 +176,9 @@ def _floors(population: Population, seeds: Sequence[int], dtype: Any) -> Floor |
     deviation, length = population.floor
     if deviation == 0:
         return None
-    keys = jax.vmap(jax.random.key)(np.asarray(seeds, np.int32))
-    drawn = jax.jit(jax.vmap(lambda key: floor.draw(key, deviation, length)))(keys)
+    with jax.enable_x64(False):  # else other numbers are drawn
+        keys = jax.vmap(jax.random.key)(np.asarray(seeds, np.int32))
+        drawn = jax.jit(jax.vmap(lambda key: floor.draw(key, deviation, length)))(keys)
     cast: Floor = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), drawn)
     return cast
 

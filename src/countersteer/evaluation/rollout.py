@@ -36,7 +36,7 @@ from countersteer.world import planar
 from countersteer.world.floor import Floor
 from countersteer.world.state import State
 
-LANES = 128  # trials of a block
+LANES, FEW = 128, 16  # trials of a block; where there are no more, of a smaller one
 LOOK = 0.005  # s between two samples that are judged, as in truth.csv
 
 DRIVING, REACHED, TOUCHED, ROLLED, STALLED, LOST, LATE = range(7)
@@ -282,16 +282,34 @@ def rollouts(
     laps: int,
     longest: float,
     report: Callable[[int, int], None] = lambda *_: None,
-    lanes: int = LANES,
+    lanes: int | None = None,
 ) -> Score:
     """One trial for each seed, its driver and what was drawn for it.
 
     `simulator` says how: course, link, step, estimate; its car is the nominal one. In the precision
     of the leaves of `drawn`. Leaves of the result have an axis of trials in front.
     """
-    course = simulator.course
-    if course is None or course.goal_distance is None:
+    if simulator.course is None or simulator.course.goal_distance is None:
         raise InputError("trials need a course with a goal")
+    dtype = np.asarray(drawn.charge).dtype
+    with jax.enable_x64(dtype == np.float64):
+        return _rollouts(
+            simulator, simulator.course, drawn, drivers, seeds, laps, longest, report, lanes
+        )
+
+
+def _rollouts(
+    simulator: Simulator,
+    course: Course,
+    drawn: Drawn,
+    drivers: Sequence[Driver],
+    seeds: Sequence[int],
+    laps: int,
+    longest: float,
+    report: Callable[[int, int], None],
+    lanes: int | None,
+) -> Score:
+    """In the precision that is set."""
     dtype = np.asarray(drawn.charge).dtype
     plan = simulator.plan()._replace(slots=planar.delay_slots(drawn.cars, simulator.dt))
     walls = padded(course.walls, dtype)
@@ -311,9 +329,9 @@ def rollouts(
         drawn.cars, own, drawn.charge, drawn.pose, drawn.floor, np.asarray(seeds, np.int32)
     )
     mesh = Mesh(np.array(jax.devices()), ("core",))
-    width = lanes * mesh.size
-    ticks = round(longest / simulator.dt)
-    scores, count = [], len(seeds)
+    ticks, count = round(longest / simulator.dt), len(seeds)
+    width = (lanes or (FEW if count <= FEW * mesh.size else LANES)) * mesh.size
+    scores = []
     for first in range(0, count, width):
         picked = np.arange(first, first + width) % count
         score = _rollout(mesh, plan, ticks, shared, _rows(varied, picked), common)
