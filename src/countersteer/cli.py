@@ -821,6 +821,7 @@ def make_driver(
     name: str, course: "Course", car: "Car", speed: float | None, laps: int
 ) -> "Driver":
     """A driver from the library, or one that replays a `commands.csv`."""
+    from countersteer.drivers import plan
     from countersteer.drivers.drift_turn import drift_turn
     from countersteer.drivers.replay import Replay
     from countersteer.drivers.straighten import straighten
@@ -837,6 +838,8 @@ def make_driver(
         return drift_turn(course, car, speed, laps)
     if name == "straighten":
         return straighten(course, car, speed)
+    if name.endswith(".toml") or name in plan.library():
+        return plan.load_plan(name, course, car, read_commands, speed, laps)
     raise InputError(f"no driver {name}: give one of {', '.join(DRIVERS)}, or a commands.csv")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.course.along import Legs, legs_of
 from countersteer.course.course import Course
 from countersteer.drivers import straighten
 from countersteer.drivers.driver import Command, Observation, paced
@@ -23,6 +24,7 @@ NEWS = 0.03  # m, standard deviation of what the front sonar says of the corner'
 DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
 SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
 GATE = 3.0  # standard deviations beyond which a reading is a spike
+INNER = 0.1  # of the straight that a corner's arc cuts off: how much of it a turn by pose cuts
 AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
 
 
@@ -92,7 +94,9 @@ class DriftTurn:
     """Straightens; turns the wheels over before the corner; turns them back in time.
 
     When the wheels turn over is told by the distance to the corner, which the front sonar and the
-    encoder tell. At each tick of the turn the driver asks how far the car would still turn if it
+    encoder tell; or (`by` "pose"), where the corners are so round that no wall stands ahead, the
+    pose estimate. Then offset and angle to the corridor are its too: side sonars mislead in a
+    curve. Corridors are for it the straights from corner point to corner point. At each tick of the turn the driver asks how far the car would still turn if it
     were stopped now (`stop_angle`), and stops when that is what is left of the target. Targets are
     headings of corridors, so a turn's error is the next one's to mend (`carry`); without that they
     are counted from the heading at which the turn was begun.
@@ -108,6 +112,9 @@ class DriftTurn:
     width: Scalar
     cone: Scalar  # half-angle of the front sonar's cone, rad
     front: int = dataclasses.field(metadata={"static": True})
+    legs: Legs
+    inner: Array  # by pose: how much sooner a turn begins than at a mitred corner, m
+    by: str = dataclasses.field(default="wall", metadata={"static": True})
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
     linked: Scalar = 0.0  # 1: a turn begins as soon as the one before has ended
     longest: Scalar = 1.2  # s that a phase of a turn may take
@@ -120,9 +127,10 @@ class DriftTurn:
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
-        return paced(self._think, memory, observation)
+        return paced(self.think, memory, observation)
 
-    def _think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+    def think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+        """The command from now on, and the memory with what is new."""
         now, own = seen.time, self.turning
         dt = now - memory.time
         straight = self.straight.follow(memory.straight, seen)
@@ -130,6 +138,10 @@ class DriftTurn:
         angle = jnp.asarray(self.angles)[memory.turn]
         gap = jnp.asarray(self.gaps)[memory.turn + 1]
         corner, doubt, spikes = self._approach(memory, seen, straight.error, angle, dt)
+        if self.by == "pose":
+            place = self.legs.seen(memory.turn, estimate.x, estimate.y, estimate.heading)
+            straight = straight._replace(offset=place.offset, error=place.bearing)
+            corner = place.distance - jnp.asarray(self.inner)[memory.turn]
 
         speed = jnp.maximum(estimate.vx, 0.5)
         lead = interpolate(own.speeds, own.lead, speed) * jnp.tan(
@@ -250,10 +262,13 @@ def drift_turn(
     laps: int = 1,
     turning: Turning = DEFAULT,
     stop_angle: StopAngle = STOPS,
+    by: str | None = None,
 ) -> DriftTurn:
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
 
-    Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
+    `by` is "wall" or "pose"; by default what the roundest corner asks for. Where the centre line's
+    radius R is over half the width w, the wall ahead stands oblique by more than
+    asin(R / (R + w/2)) = 30°, and is no longer where a mitred corner's would be. Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
     """
     turns = course.turns_ahead(laps)
     if course.closed and not turns:
@@ -264,6 +279,9 @@ def drift_turn(
     marks = [course.start_distance] + [t.distance for t in turns]
     sonar = car.sensors.sonar
     front = straighten.mount_number(car, "front")
+    width = course.width or 1.0
+    if by is None:
+        by = "pose" if any(t.radius > width / 2 for t in turns) else "wall"
     return DriftTurn(
         straight=straighten.straighten(course, car, SPEED if speed is None else speed),
         turning=turning,
@@ -272,7 +290,10 @@ def drift_turn(
         gaps=np.append(np.diff(marks), [1e3, 1e3]),
         front_x=sonar.mounts[front].x,
         front_axle=car.body.front_axle,
-        width=course.width or 1.0,
+        width=width,
         cone=sonar.half_angle,
         front=front,
+        legs=legs_of(course, laps),
+        inner=np.array([INNER * t.radius * math.tan(abs(t.angle) / 2) for t in turns] + [0.0]),
+        by=by,
     )
