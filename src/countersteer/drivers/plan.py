@@ -122,16 +122,19 @@ class Plan:
         dt, estimate = seen.time - memory.time, seen.estimate
         here = self.line.find(estimate.x, estimate.y, memory.along)
         speed = jnp.sqrt(estimate.vx**2 + estimate.vy**2 + 1e-12)
-        echo = self._heard(memory.echo, seen, dt)
+        heard = self._heard(memory.echo, seen, dt)
         before = self._policy(memory.number)
         over_limit = jnp.abs(estimate.yaw_rate) >= before.until.yaw_rate
         memory = memory._replace(
             driven=memory.driven + dt * speed,
             stirred=jnp.where(over_limit, 1, memory.stirred),
             along=here.distance,
-            echo=echo,
+            echo=heard,
         )
         number, begins = self._next(memory, before, seen, here)
+        # What was ahead in a turn says nothing of the straight behind it.
+        echo = jax.tree.map(lambda new: jnp.where(begins, jnp.inf, new), heard[:2])
+        memory = memory._replace(echo=spikes.Memory(*echo, heard.tick))
         own = self._policy(number)
 
         drifts = own.does == DRIFT
@@ -325,6 +328,20 @@ def plan(
         wheelbase=car.body.wheelbase,
         rear_axle=car.body.wheelbase - car.body.front_axle,
     )
+
+
+def library() -> dict[str, str]:
+    """Names of the plans that come with the package, and what they say of themselves."""
+    names = sorted(p.name.removesuffix(".toml") for p in LIBRARY.iterdir())
+    tables = {name: read_toml(name, LIBRARY, "driver")[0] for name in names}
+    return {n: str(t["description"]) for n, t in tables.items() if t["kind"] == "plan"}
+
+
+def is_plan(name: str) -> bool:
+    """Whether a driver's name is a plan's: of the library, or a file of this kind."""
+    if name.endswith(".toml"):
+        return bool(read_toml(name, LIBRARY, "driver")[0].get("kind") == "plan")
+    return name in library()
 
 
 def load_plan(
