@@ -1057,10 +1057,8 @@ def make_driver(
         return drift_turn(course, car, speed, laps, *load_policy(name))
     if name == "straighten":
         return straighten(course, car, speed)
-    raise InputError(
-        f"no driver {name}: give one of {', '.join([*DRIVERS, *plan.library()])}, a policy or plan .toml, or "
-        "a commands.csv"
-    )
+    known = ", ".join([*DRIVERS, *plan.library()])
+    raise InputError(f"no driver {name}: give one of {known}, a .toml or a commands.csv")
 
 
 INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")

@@ -63,7 +63,7 @@ class Line(NamedTuple):
         )
 
     def at(self, distance: Scalar) -> tuple[Scalar, Scalar]:
-        """x and y of the line at a distance; beyond the ends of an open course straight on."""
+        """Where the line is at a distance (x, y); beyond the ends of an open course straight on."""
         wrapped = jnp.where(jnp.isinf(self.whole), distance, jnp.mod(distance, self.whole))
         piece = jnp.clip(jnp.searchsorted(jnp.asarray(self.mark), wrapped, side="right") - 1, 0)
         on = wrapped - jnp.asarray(self.mark)[piece]

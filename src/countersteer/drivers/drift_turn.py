@@ -62,17 +62,18 @@ class DriftTurn:
 
     When the wheels turn over is told by the distance to the corner, which the front sonar and the
     encoder tell; or (`by` "pose"), where the corners are so round that no wall stands ahead, the
-    pose estimate. Then offset and angle to the corridor are its too: side sonars mislead in a
-    curve. Corridors are for it the straights from corner point to corner point. At each tick of the turn the driver asks how far the car would still turn if it
-    were stopped now (`stop_angle`), and stops when that is what is left of the target. Targets are
-    headings of corridors, so a turn's error is the next one's to mend (`carry`); without that they
-    are counted from the heading at which the turn was begun.
+    pose estimate. Then it tells offset and angle to the corridor too, as side sonars mislead in a
+    curve; corridors are for it the straights from corner point to corner point. At each tick of the
+    turn the driver asks how far the car would still turn if it were stopped now (`stop_angle`), and
+    stops when that is what is left of the target. Targets are headings of corridors, so a turn's
+    error is the next one's to mend (`carry`, by the wall); without that they are counted from the
+    heading at which the turn was begun.
     """
 
     straight: Straighten
     turning: Turning
     stop_angle: StopAngle
-    angles: np.ndarray  # of the turns in their order, rad; 0 behind the last
+    angles: Array  # of the turns in their order, rad; 0 behind the last
     gaps: np.ndarray  # distance along the centre line to each turn from the one before, m
     front_x: Scalar  # mount of the front sonar, m
     front_axle: Scalar

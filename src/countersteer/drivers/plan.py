@@ -32,6 +32,7 @@ LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
 KINDS = STRAIGHTEN, COMMANDS, DRIFT, CURVE = range(4)
 NAMES = ("straighten", "commands", "drift", "curve")
 ASTRAY = 0.5  # m outside its place from which on a policy has missed its hand-over
+ALIGNED = 0.3  # rad to the corridor within which what the front sonar sees stands at its end
 AHEAD = (0.2, 0.15)  # how far a curve looks ahead: m, and s at the car's speed
 REVERSE = 0.05  # m/s by which the car may come nearer to a wall than its forward speed says
 
@@ -110,7 +111,7 @@ class Plan:
     def reset(self, key: jax.Array) -> Memory:
         """Before the first policy has begun."""
         none = spikes.Memory(math.inf, math.inf, 0)
-        start = float(self.line.start)
+        start = self.line.start
         first = (0, 0, 0, 0.0, 0.0, start, 0.0, 0, start, none)
         return Memory(*first, self.drift.reset(key))
 
@@ -133,8 +134,12 @@ class Plan:
         )
         number, begins = self._next(memory, before, seen, here)
         # What was ahead in a turn says nothing of the straight behind it.
-        echo = jax.tree.map(lambda new: jnp.where(begins, jnp.inf, new), heard[:2])
-        memory = memory._replace(echo=spikes.Memory(*echo, heard.tick))
+        memory = memory._replace(
+            echo=heard._replace(
+                believed=jnp.where(begins, jnp.inf, heard.believed),
+                heard=jnp.where(begins, jnp.inf, heard.heard),
+            )
+        )
         own = self._policy(number)
 
         drifts = own.does == DRIFT
@@ -187,11 +192,12 @@ class Plan:
         coming = behind + jnp.mod(until.passes - behind, self.line.whole)
         coming = jnp.where(open_ended, until.passes, coming)
         hand = jnp.sign(until.turned)
+        aligned = jnp.abs(memory.drift.straight.error) < ALIGNED
         over = (
             (memory.driven >= until.driven)
             | (hand * (estimate.heading - memory.heading) >= jnp.abs(until.turned))
             | (seen.time - memory.since >= until.time - 1e-6)
-            | (memory.echo.believed <= until.wall)
+            | (aligned & (memory.echo.believed <= until.wall))
             | (jnp.isfinite(until.passes) & (here.distance >= coming))
             | ((memory.stirred > 0) & (jnp.abs(estimate.yaw_rate) < until.yaw_rate))
             | (estimate.vx >= until.speed)
@@ -202,13 +208,13 @@ class Plan:
             jnp.minimum(memory.number + 1, count - 1),
             (memory.number + 1) % count,
         )
-        over = over & (after != memory.number)
-        number = jnp.where(over, after, memory.number)
-
-        # Who believes its pose to half a metre, and is elsewhere, has missed a hand-over.
+        # Who believes its pose to half a metre, and is elsewhere, has missed a hand-over; and a
+        # condition that is met where the next has no place was something else's.
         spread = estimate.pose_covariance
         sure = spread.xx + spread.yy < ASTRAY**2
         holds, inside = self._places(here.distance)
+        over = over & (after != memory.number) & (holds[after] | ~sure)
+        number = jnp.where(over, after, memory.number)
         in_order = (number + 1 + jnp.arange(count)) % count
         takes = in_order[jnp.argmax(inside[in_order])]
         mends = sure & ~holds[number] & jnp.any(inside)
@@ -396,12 +402,12 @@ def _policy(
         else:
             if not isinstance(row["commands"], str):
                 raise InputError(f"{where}: commands must be the path of a commands.csv")
-            table = read(folder / row["commands"])
-            times = np.asarray(table["time_s"]) - table["time_s"][0]
-            throttle, steering = np.asarray(table["throttle"]), np.asarray(table["steering"])
+            played = read(folder / row["commands"])
+            times = np.asarray(played["time_s"]) - played["time_s"][0]
+            throttle, steering = np.asarray(played["throttle"]), np.asarray(played["steering"])
     return Policies(
         does=np.array(NAMES.index(does)),
-        speed=np.array(numbers.get("speed_mps", speed) if "speed_mps" in row else speed),
+        speed=np.array(numbers["speed_mps"] if "speed_mps" in row else speed),
         angle=np.array(numbers["turn_deg"] if "turn_deg" in row else 0.0),
         begin=np.array(numbers["from_m"]),
         end=np.array(numbers["to_m"]),
