@@ -346,9 +346,9 @@ def parser() -> Parser:
     stop.add_argument(
         "--most-deg",
         type=number(1, 360),
-        default=30.0,
+        default=90.0,
         metavar="DEG",
-        help="leave out turns that ran on for more than this (default 30)",
+        help="leave out turns that ran on for more than this (default 90)",
     )
 
     tune = verb("tune", "logs of a car to the car's numbers", run_tune)

@@ -24,7 +24,7 @@ from countersteer.evaluation.local_regression import (
 )
 from countersteer.runs.files import Table
 
-MOST = math.radians(30)  # that a turn may go on for
+MOST = math.radians(30)  # that a turn may go on for, where the lines shall be straight
 
 
 class Stops(NamedTuple):
