@@ -25,7 +25,6 @@ NEWS = 0.03  # m, standard deviation of what the front sonar says of the corner'
 DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
 SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
 GATE = 3.0  # standard deviations beyond which a reading is a spike
-INNER = 0.1  # of the straight that a corner's arc cuts off: how much of it a turn by pose cuts
 AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
 
 
@@ -81,7 +80,6 @@ class DriftTurn:
     cone: Scalar  # half-angle of the front sonar's cone, rad
     front: int = dataclasses.field(metadata={"static": True})
     legs: Legs
-    inner: Array  # by pose: how much sooner a turn begins than at a mitred corner, m
     by: str = dataclasses.field(default="wall", metadata={"static": True})
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
     linked: Scalar = 0.0  # 1: a turn begins as soon as the one before has ended
@@ -109,7 +107,7 @@ class DriftTurn:
         if self.by == "pose":
             place = self.legs.seen(memory.turn, estimate.x, estimate.y, estimate.heading)
             straight = straight._replace(offset=place.offset, error=place.bearing)
-            corner = place.distance - jnp.asarray(self.inner)[memory.turn]
+            corner = place.distance
 
         speed = jnp.maximum(estimate.vx, 0.5)
         lead = interpolate(own.speeds, own.lead, speed) * jnp.tan(
@@ -242,6 +240,5 @@ def drift_turn(
         cone=sonar.half_angle,
         front=front,
         legs=legs_of(course, laps),
-        inner=np.array([INNER * t.radius * math.tan(abs(t.angle) / 2) for t in turns] + [0.0]),
         by=by,
     )
