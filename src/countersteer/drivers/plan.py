@@ -145,10 +145,10 @@ class Plan:
         drifts = own.does == DRIFT
         angle = jnp.where(begins, own.angle, 0.0)
         last = memory.drift._replace(
-            turn=0, phase=jnp.where(begins, drift_turn.STRAIGHT, memory.drift.phase)
+            turn=1, phase=jnp.where(begins, drift_turn.STRAIGHT, memory.drift.phase)
         )
-        # A drift that may begin at once does so where there is an angle to turn.
-        angles = jnp.stack([jnp.where(drifts, angle, 0.0)])
+        # One of linked turns, after the first, begins at once where there is an angle to turn.
+        angles = jnp.stack([0.0 * angle, jnp.where(drifts, angle, 0.0)])
         turning, drift = dataclasses.replace(self.drift, angles=angles).think(last, seen)
         straight = self.straight.turned(drift.straight, angle, begins & ~drifts)
         memory = memory._replace(
