@@ -104,13 +104,13 @@ def test_a_batch_judges_as_a_recorded_drive_is_judged():
     time, turn = 0.001 * record.tick[every], record.turn[every]
     found = find_turns(course, time, motion.heading, motion.vx, motion.vy, motion.yaw_rate, turn, 1)
     with jax.enable_x64(True):
-        line = rollout.line_of(course, 1, np.float64)
+        way = rollout.way_of(course, 1, np.float64)
         score = rollout.initial_score(course, 4, np.float64)
         state = Sample(motion, record.rolled_over[every], record.wall_contacts[every])
 
         def step(score, sample):
             now, turns, state = sample
-            return rollout.follow(line, score, state, turns, now), None
+            return rollout.follow(way, score, state, turns, now), None
 
         score, _ = jax.lax.scan(step, score, (time, turn, state))
     assert len(found) == 4
@@ -172,9 +172,9 @@ def test_progress_along_the_line_is_that_of_the_course():
     from countersteer.course.course import place
 
     xy = np.array([place(course, d)[:2] for d in along]) + rng.uniform(-0.3, 0.3, (60, 2))
-    line = rollout.line_of(course, 1, np.float32)
+    line = rollout.line_of(course, np.float32)
     last, found = jnp.float32(0.5), []
     for x, y in xy:
-        last = rollout._progress(line, x, y, last)
+        last = line.follow(x, y, last).distance
         found.append(float(last))
     assert found == pytest.approx(progress(course, xy[:, 0], xy[:, 1], 0.5), abs=1e-4)

@@ -303,7 +303,7 @@ def test_the_parameters_that_are_listed_make_the_car(name):
 
 
 def test_lists_tell_one_from_another_and_align(capsys):
-    for what, count in (("cars", len(library())), ("courses", len(courses())), ("drivers", 2)):
+    for what, count in (("cars", len(library())), ("courses", len(courses())), ("drivers", 4)):
         assert cli.main(["list", what]) == 0
         text = capsys.readouterr().out
         assert cli.main(["list", what, "--json"]) == 0

@@ -163,7 +163,8 @@ def parser() -> Parser:
     drive.add_argument(
         "--driver",
         default="drift-turn",
-        help=f"{', '.join(DRIVERS)}, a policy .toml, or a commands.csv (default drift-turn)",
+        help=f"{', '.join(DRIVERS)}, a plan's name, a policy or plan .toml, or a commands.csv "
+        "(default drift-turn)",
     )
     physics(drive, "rx7")
     drive.add_argument(
@@ -1003,7 +1004,10 @@ def run_list(options: argparse.Namespace) -> int:
     found = {
         "cars": listing.cars,
         "courses": listing.courses,
-        "drivers": lambda: listing.drivers(DRIVERS),
+        "drivers": lambda: [
+            *listing.drivers(DRIVERS),
+            *({"name": name, "description": text} for name, text in plans().items()),
+        ],
         "parameters": lambda: listing.parameters(options.car),
     }[options.what]()
     if options.json:
@@ -1017,15 +1021,23 @@ def run_completion(options: argparse.Namespace) -> int:
     """`completion`."""
     from countersteer.completion import script
 
-    text = script(parser(), options.shell, DRIVERS)
+    text = script(parser(), options.shell, [*DRIVERS, *plans()])
     print(json.dumps({"script": text}) if options.json else text)
     return DONE
+
+
+def plans() -> dict[str, str]:
+    """The plans of the library, and what they say of themselves."""
+    from countersteer.drivers.plan import library
+
+    return library()
 
 
 def make_driver(
     name: str, course: "Course", car: "Car", speed: float | None, laps: int
 ) -> "Driver":
-    """A driver from the library or a policy, or one that replays a `commands.csv`."""
+    """A driver from the library, a policy or a plan, or one that replays a `commands.csv`."""
+    from countersteer.drivers import plan
     from countersteer.drivers.drift_turn import drift_turn
     from countersteer.drivers.policy import load_policy
     from countersteer.drivers.replay import Replay
@@ -1039,13 +1051,14 @@ def make_driver(
         return Replay(
             times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
         )
+    if plan.is_plan(name):
+        return plan.load_plan(name, course, car, read_commands, speed, laps)
     if name == "drift-turn" or name.endswith(".toml"):
         return drift_turn(course, car, speed, laps, *load_policy(name))
     if name == "straighten":
         return straighten(course, car, speed)
-    raise InputError(
-        f"no driver {name}: give one of {', '.join(DRIVERS)}, a policy .toml or a commands.csv"
-    )
+    known = ", ".join([*DRIVERS, *plan.library()])
+    raise InputError(f"no driver {name}: give one of {known}, a .toml or a commands.csv")
 
 
 INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")

@@ -21,6 +21,7 @@ class Turn(NamedTuple):
 
     distance: float  # of the corner point (or the middle of its arc) along the centre line, m
     angle: float  # positive to the left, rad
+    radius: float = 0.0  # of its arc, m; 0: a mitred corner
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +63,9 @@ class Course:
         """The turns between start and goal, at unwrapped distances, in the order driven."""
         end = self.lap_end(laps)
         rounds = range(laps + 1) if self.closed else range(1)
-        ahead = [Turn(t.distance + k * self.length, t.angle) for k in rounds for t in self.turns]
+        ahead = [
+            t._replace(distance=t.distance + k * self.length) for k in rounds for t in self.turns
+        ]
         return [t for t in ahead if self.start_distance < t.distance < (end or 0.0)]
 
 
@@ -174,7 +177,7 @@ def _rounded(
         walked += float(lengths[i - 1]) - trims[i - 1] - trims[i]
         bend = abs(angles[i]) * radii[i]
         if angles[i]:
-            turns.append(Turn(walked + bend / 2, angles[i]))
+            turns.append(Turn(walked + bend / 2, angles[i], radii[i]))
         walked += bend
     return points, tuple(turns)
 

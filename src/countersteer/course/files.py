@@ -133,7 +133,12 @@ def course_tables(course: Course) -> dict[str, Any]:
         "walls_m": course.walls.tolist(),
         "line_m": course.line.tolist(),
         "turns": [
-            {"distance_m": t.distance, "turn_deg": math.degrees(t.angle)} for t in course.turns
+            {
+                "distance_m": t.distance,
+                "turn_deg": math.degrees(t.angle),
+                "radius_m": t.radius,
+            }
+            for t in course.turns
         ],
     }
     if course.width is not None:
@@ -159,7 +164,10 @@ def course_of_run(about: dict[str, Any]) -> Course | None:
             line=np.array(tables["line_m"], float).reshape(-1, 2),
             walls=np.array(tables["walls_m"], float).reshape(-1, 4),
             turns=tuple(
-                Turn(float(t["distance_m"]), math.radians(t["turn_deg"])) for t in tables["turns"]
+                Turn(
+                    float(t["distance_m"]), math.radians(t["turn_deg"]), float(t.get("radius_m", 0))
+                )
+                for t in tables["turns"]
             ),
             start=(float(start["x_m"]), float(start["y_m"]), float(start["heading_rad"])),
             start_distance=float(tables["start_distance_m"]),

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Scalar, pytree
+from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.course.along import Legs, legs_of
 from countersteer.course.course import Course
 from countersteer.drivers import policy, straighten
 from countersteer.drivers.driver import Command, Observation, paced
@@ -59,22 +60,27 @@ class DriftTurn:
     """Straightens; turns the wheels over before the corner; turns them back in time.
 
     When the wheels turn over is told by the distance to the corner, which the front sonar and the
-    encoder tell. At each tick of the turn the driver asks how far the car would still turn if it
-    were stopped now (`stop_angle`), and stops when that is what is left of the target. Targets are
-    headings of corridors, so a turn's error is the next one's to mend (`carry`); without that they
-    are counted from the heading at which the turn was begun.
+    encoder tell; or (`by` "pose"), where the corners are so round that no wall stands ahead, the
+    pose estimate. Then it tells offset and angle to the corridor too, as side sonars mislead in a
+    curve; corridors are for it the straights from corner point to corner point. At each tick of the
+    turn the driver asks how far the car would still turn if it were stopped now (`stop_angle`), and
+    stops when that is what is left of the target. Targets are headings of corridors, so a turn's
+    error is the next one's to mend (`carry`, by the wall); without that they are counted from the
+    heading at which the turn was begun.
     """
 
     straight: Straighten
     turning: Turning
     stop_angle: StopAngle
-    angles: np.ndarray  # of the turns in their order, rad; 0 behind the last
+    angles: Array  # of the turns in their order, rad; 0 behind the last
     gaps: np.ndarray  # distance along the centre line to each turn from the one before, m
     front_x: Scalar  # mount of the front sonar, m
     front_axle: Scalar
     width: Scalar
     cone: Scalar  # half-angle of the front sonar's cone, rad
     front: int = dataclasses.field(metadata={"static": True})
+    legs: Legs
+    by: str = dataclasses.field(default="wall", metadata={"static": True})
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
     linked: Scalar = 0.0  # 1: a turn begins as soon as the one before is stopped, walls or not
     longest: Scalar = 1.2  # s that a phase of a turn may take
@@ -87,9 +93,10 @@ class DriftTurn:
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
-        return paced(self._think, memory, observation)
+        return paced(self.think, memory, observation)
 
-    def _think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+    def think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+        """The command from now on, and the memory with what is new."""
         now, own = seen.time, self.turning
         dt = now - memory.time
         straight = self.straight.follow(memory.straight, seen)
@@ -97,6 +104,10 @@ class DriftTurn:
         angle = jnp.asarray(self.angles)[memory.turn]
         gap = jnp.asarray(self.gaps)[memory.turn + 1]
         corner, doubt, spikes = self._approach(memory, seen, straight.error, angle, dt)
+        if self.by == "pose":
+            place = self.legs.seen(memory.turn, estimate.x, estimate.y, estimate.heading)
+            straight = straight._replace(offset=place.offset, error=place.bearing)
+            corner = place.distance
 
         speed = jnp.maximum(estimate.vx, 0.5)
         lead = own.begins_at(speed, estimate.friction) * jnp.tan(
@@ -204,10 +215,14 @@ def drift_turn(
     laps: int = 1,
     turning: Turning | None = None,
     stop_angle: StopAngle | None = None,
+    by: str | None = None,
 ) -> DriftTurn:
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
 
-    Laws that are not given are those of the library's policy.
+    Laws that are not given are those of the library's policy. `by` is "wall" or "pose"; by default
+    what the roundest corner asks for. Where the centre line's radius R is over half the width w,
+    the wall ahead stands oblique by more than asin(R / (R + w/2)) = 30°, and is no longer where
+    that of a mitred corner would be.
 
     Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
     """
@@ -220,6 +235,9 @@ def drift_turn(
     marks = [course.start_distance] + [t.distance for t in turns]
     sonar = car.sensors.sonar
     front = straighten.mount_number(car, "front")
+    width = course.width or 1.0
+    if by is None:
+        by = "pose" if any(t.radius > width / 2 for t in turns) else "wall"
     return DriftTurn(
         straight=straighten.straighten(course, car, SPEED if speed is None else speed),
         turning=turning or policy.library().turning,
@@ -228,7 +246,9 @@ def drift_turn(
         gaps=np.append(np.diff(marks), [1e3, 1e3]),
         front_x=sonar.mounts[front].x,
         front_axle=car.body.front_axle,
-        width=course.width or 1.0,
+        width=width,
         cone=sonar.half_angle,
         front=front,
+        legs=legs_of(course, laps),
+        by=by,
     )

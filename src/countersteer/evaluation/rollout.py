@@ -18,6 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Array, Scalar
+from countersteer.course.along import Line, line_of
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
@@ -46,15 +47,10 @@ STATUS = (
 )  # fmt: skip
 
 
-class Line(NamedTuple):
+class Way(NamedTuple):
     """The centre line, and what the judge must know of the course."""
 
-    begin: Array  # (n, 2) of each piece
-    along: Array  # (n, 2) direction
-    length: Array  # (n,)
-    mark: Array  # (n,) distance of the beginning
-    whole: Scalar  # length of the line, or inf where it is open
-    near: Scalar  # m along the line between two samples, at most
+    line: Line
     goal: Scalar
     bearings: Array  # (turns,) heading of the corridor behind each turn
 
@@ -84,22 +80,11 @@ class Score(NamedTuple):
     turns: Turns
 
 
-def line_of(course: Course, laps: int, dtype: Any) -> Line:
-    """The centre line as arrays."""
-    steps = np.diff(course.line, axis=0)
-    lengths = np.hypot(*steps.T)
+def way_of(course: Course, laps: int, dtype: Any) -> Way:
+    """The way between start and goal as arrays."""
     bearings = course.start[2] + np.cumsum([t.angle for t in course.turns_ahead(laps)])
-    values = (
-        course.line[:-1],
-        steps / lengths[:, None],
-        lengths,
-        course.marks[:-1],
-        course.length if course.closed else math.inf,
-        1.5 * (course.width or 1.0),
-        course.lap_end(laps),
-        bearings,
-    )
-    return Line(*(np.asarray(value, dtype) for value in values))
+    goal = np.asarray(course.lap_end(laps), dtype)
+    return Way(line_of(course, dtype), goal, np.asarray(bearings, dtype))
 
 
 def initial_score(course: Course, turns: int, dtype: Any) -> Score:
@@ -111,7 +96,7 @@ def initial_score(course: Course, turns: int, dtype: Any) -> Score:
     return Score(np.int32(DRIVING), distance, distance, dtype(0), inf, dtype(0), table)
 
 
-def follow(line: Line, score: Score, state: State, turn: Scalar, time: Scalar) -> Score:
+def follow(way: Way, score: Score, state: State, turn: Scalar, time: Scalar) -> Score:
     """The score with one sample more; a trial that is over stays as it is."""
     motion = state.motion
     speed = jnp.sqrt(motion.vx**2 + motion.vy**2 + 1e-12)
@@ -119,10 +104,10 @@ def follow(line: Line, score: Score, state: State, turn: Scalar, time: Scalar) -
     rate = jnp.abs(motion.yaw_rate)
     calm = (rate < STRAIGHT_RATE) & (slip < STRAIGHT_SLIP)
 
-    distance = _progress(line, motion.x, motion.y, score.distance)
+    distance = way.line.follow(motion.x, motion.y, score.distance).distance
     ahead = distance > score.furthest + 0.05
     goal_time = jnp.where(
-        jnp.isinf(score.goal_time) & (distance >= line.goal), time, score.goal_time
+        jnp.isinf(score.goal_time) & (distance >= way.goal), time, score.goal_time
     )
     stirred_at = jnp.where(calm, score.stirred_at, time)
 
@@ -136,7 +121,7 @@ def follow(line: Line, score: Score, state: State, turn: Scalar, time: Scalar) -
     late = time - begin >= LONGEST - 1e-4
     settled = (stirred > 0) & calm & (time - calm_since >= STRAIGHT_FOR - 1e-4)
     ends = under_way & (late | settled)
-    error = motion.heading - line.bearings
+    error = motion.heading - way.bearings
     error = error - 2 * math.pi * jnp.round(error / (2 * math.pi))
     turns = Turns(
         begin,
@@ -175,19 +160,6 @@ def follow(line: Line, score: Score, state: State, turn: Scalar, time: Scalar) -
     return jax.tree.map(lambda a, b: jnp.where(over, a, b), score, new)
 
 
-def _progress(line: Line, x: Scalar, y: Scalar, last: Scalar) -> Scalar:
-    """As `course.progress`: the nearest place of the line not far from the last."""
-    dx, dy = x - line.begin[:, 0], y - line.begin[:, 1]
-    on = jnp.clip(dx * line.along[:, 0] + dy * line.along[:, 1], 0.0, line.length)
-    away = (dx - on * line.along[:, 0]) ** 2 + (dy - on * line.along[:, 1]) ** 2
-    where = line.mark + on
-    rounds = jnp.where(jnp.isinf(line.whole), 0.0, jnp.round((last - where) / line.whole))
-    where = where + jnp.where(jnp.isinf(line.whole), 0.0, rounds * line.whole)
-    away = jnp.where(jnp.abs(where - last) <= line.near, away, jnp.inf)
-    best = jnp.argmin(away)
-    return jnp.where(jnp.isinf(away[best]), last, where[best])
-
-
 class Trials(NamedTuple):
     """What a batch of trials runs with; leaves have an axis of trials in front."""
 
@@ -207,7 +179,7 @@ class Shared(NamedTuple):
     loss: Scalar
     nominal: Car  # the one that the filter knows
     start: tuple[Scalar, Scalar, Scalar]  # the one that the driver believes
-    line: Line
+    way: Way
     score: Score  # before the first sample
 
 
@@ -260,7 +232,7 @@ def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> Score:
         loop, score, _ = carry
         time = plan.dt * loop.tick.astype(score.distance.dtype)
         turn = jnp.asarray(getattr(loop.memory, "turn", 0))
-        score = follow(shared.line, score, loop.state, turn, time)
+        score = follow(shared.way, score, loop.state, turn, time)
         loop, _ = jax.lax.scan(one, loop, None, length=every)
         # Common to the block, so that the loop's end is.
         going = jax.lax.pmax((score.status == DRIVING).astype(jnp.int32), "trial")
@@ -313,15 +285,15 @@ def _rollouts(
     dtype = np.asarray(drawn.charge).dtype
     plan = simulator.plan()._replace(slots=planar.delay_slots(drawn.cars, simulator.dt))
     walls = padded(course.walls, dtype)
-    line = line_of(course, laps, dtype)
-    start = initial_score(course, len(line.bearings), dtype.type)
+    way = way_of(course, laps, dtype)
+    start = initial_score(course, len(way.bearings), dtype.type)
     shared = Shared(
         walls,
         sonar.edges(walls),
         dtype.type(simulator.link.loss),
         jax.tree.map(dtype.type, simulator.nominal or simulator.car),
         tuple(map(dtype.type, course.start)),
-        line,
+        way,
         start,
     )
     common, own = _common(drivers, dtype)

@@ -1,0 +1,431 @@
+"""A course's plan: policies, the places where each holds, and the conditions that hand over.
+
+Read from a TOML file (docs/plans.md). Policies that only play commands and policies that look at
+the car mix; all share what is known of the corridor, which is followed whichever of them steers.
+"""
+
+import dataclasses
+import importlib.resources
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.car.files import read_toml
+from countersteer.car.parameter import Array, Scalar, pytree, unknown_key
+from countersteer.course.along import Line, Place, line_of
+from countersteer.course.course import Course
+from countersteer.drivers import drift_turn
+from countersteer.drivers.drift_turn import DriftTurn
+from countersteer.drivers.driver import Command, Observation, paced
+from countersteer.drivers.straighten import Straighten
+from countersteer.errors import InputError
+from countersteer.estimation import spikes
+from countersteer.estimation.estimate import Estimate
+
+LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
+KINDS = STRAIGHTEN, COMMANDS, DRIFT, CURVE = range(4)
+NAMES = ("straighten", "commands", "drift", "curve")
+ASTRAY = 0.5  # m outside its place from which on a policy has missed its hand-over
+ALIGNED = 0.3  # rad to the corridor within which what the front sonar sees stands at its end
+AHEAD = (0.2, 0.15)  # how far a curve looks ahead: m, and s at the car's speed
+REVERSE = 0.05  # m/s by which the car may come nearer to a wall than its forward speed says
+
+
+class Until(NamedTuple):
+    """When a policy hands over: at the first of these. SI; what is never reached is infinite."""
+
+    driven: Array  # m since it began, by odometry
+    turned: Array  # rad since it began, to the left
+    time: Array  # s since it began
+    wall: Array  # m to the wall ahead, or less
+    passes: Array  # m along the centre line
+    yaw_rate: Array  # rad/s, once it has been above
+    speed: Array  # m/s, or more
+
+
+class Policies(NamedTuple):
+    """All of them: each array has a row for each, in their order."""
+
+    does: Array  # one of `KINDS`
+    speed: Array  # m/s
+    angle: Array  # by which the corridor turns as it begins, rad
+    begin: Array  # place where it holds, m along the centre line; infinite: everywhere
+    end: Array
+    until: Until
+    times: Array  # (n, m) s since it began, of its commands; infinite behind the last
+    throttle: Array
+    steering: Array  # rad
+
+
+class Memory(NamedTuple):
+    """What the driver is about."""
+
+    number: Scalar  # of the policy that holds
+    begun: Scalar  # whether it has
+    turn: Scalar  # turns begun
+    since: Scalar  # s, and so on: when it began
+    heading: Scalar
+    distance: Scalar
+    driven: Scalar  # m since
+    stirred: Scalar  # whether the yaw rate was above its limit since
+    along: Scalar  # distance along the centre line, m
+    echo: spikes.Memory
+    drift: drift_turn.Memory  # with what is known of the corridor
+
+    @property
+    def time(self) -> Scalar:
+        """Of the last thought (s)."""
+        return self.drift.time
+
+    @property
+    def command(self) -> Command:
+        """The last."""
+        return self.drift.command
+
+
+@pytree
+class Plan:
+    """Policies in their order; where the pose tells another's place, that one takes over.
+
+    The one after the last is the first where the course is closed; else the last holds to the end.
+    """
+
+    policies: Policies
+    drift: DriftTurn  # by which all drifts are driven; its `straight` is everyone's
+    line: Line
+    noise: Scalar  # of a sonar's distance, m
+    wheelbase: Scalar
+    rear_axle: Scalar  # behind the centre of mass, m
+
+    @property
+    def straight(self) -> Straighten:
+        """What keeps to the corridor's middle."""
+        return self.drift.straight
+
+    def reset(self, key: jax.Array) -> Memory:
+        """Before the first policy has begun."""
+        none = spikes.Memory(math.inf, math.inf, 0)
+        start = self.line.start
+        first = (0, 0, 0, 0.0, 0.0, start, 0.0, 0, start, none)
+        return Memory(*first, self.drift.reset(key))
+
+    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+        """One control period."""
+        return paced(self._think, memory, observation)
+
+    def _think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+        dt, estimate = seen.time - memory.time, seen.estimate
+        here = self.line.find(estimate.x, estimate.y, memory.along)
+        speed = jnp.sqrt(estimate.vx**2 + estimate.vy**2 + 1e-12)
+        heard = self._heard(memory.echo, seen, dt)
+        before = self._policy(memory.number)
+        over_limit = jnp.abs(estimate.yaw_rate) >= before.until.yaw_rate
+        memory = memory._replace(
+            driven=memory.driven + dt * speed,
+            stirred=jnp.where(over_limit, 1, memory.stirred),
+            along=here.distance,
+            echo=heard,
+        )
+        number, begins = self._next(memory, before, seen, here)
+        # What was ahead in a turn says nothing of the straight behind it.
+        memory = memory._replace(
+            echo=heard._replace(
+                believed=jnp.where(begins, jnp.inf, heard.believed),
+                heard=jnp.where(begins, jnp.inf, heard.heard),
+            )
+        )
+        own = self._policy(number)
+
+        drifts = own.does == DRIFT
+        angle = jnp.where(begins, own.angle, 0.0)
+        last = memory.drift._replace(
+            turn=1, phase=jnp.where(begins, drift_turn.STRAIGHT, memory.drift.phase)
+        )
+        # One of linked turns, after the first, begins at once where there is an angle to turn.
+        angles = jnp.stack([0.0 * angle, jnp.where(drifts, angle, 0.0)])
+        turning, drift = dataclasses.replace(self.drift, angles=angles).think(last, seen)
+        straight = self.straight.turned(drift.straight, angle, begins & ~drifts)
+        memory = memory._replace(
+            number=number,
+            begun=1,
+            turn=memory.turn + (angle != 0),
+            since=jnp.where(begins, seen.time, memory.since),
+            heading=jnp.where(begins, estimate.heading, memory.heading),
+            distance=jnp.where(begins, here.distance, memory.distance),
+            driven=jnp.where(begins, 0.0, memory.driven),
+            stirred=jnp.where(begins, 0, memory.stirred),
+        )
+
+        on = self.straight.command(straight, seen, own.speed)
+        table = jnp.sum(own.times <= seen.time - memory.since + 1e-6) - 1
+        steering, throttle = on.steering, on.throttle
+        for which, lock, power in (
+            (COMMANDS, own.steering[table], own.throttle[table]),
+            (DRIFT, turning.steering, turning.throttle),
+            (CURVE, self._pursued(estimate, here), on.throttle),
+        ):
+            steering = jnp.where(own.does == which, lock, steering)
+            throttle = jnp.where(own.does == which, power, throttle)
+        limit = self.straight.limit
+        command = Command(throttle, jnp.clip(steering, -limit, limit))
+        drift = drift._replace(straight=straight._replace(command=command))
+        return command, memory._replace(drift=drift)
+
+    def _policy(self, number: Scalar) -> Policies:
+        """One of them."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[number], self.policies)
+
+    def _next(
+        self, memory: Memory, own: Policies, seen: Observation, here: Place
+    ) -> tuple[Scalar, Scalar]:
+        """The policy from now on, and whether it begins now."""
+        until, estimate, count = own.until, seen.estimate, len(self.policies.does)
+        # On a closed course each round has the place: it is the one that lay ahead as the policy
+        # began, or less than a quarter of a round behind.
+        open_ended, behind = jnp.isinf(self.line.whole), memory.distance - self.line.whole / 4
+        coming = behind + jnp.mod(until.passes - behind, self.line.whole)
+        coming = jnp.where(open_ended, until.passes, coming)
+        hand = jnp.sign(until.turned)
+        aligned = jnp.abs(memory.drift.straight.error) < ALIGNED
+        over = (
+            (memory.driven >= until.driven)
+            | (hand * (estimate.heading - memory.heading) >= jnp.abs(until.turned))
+            | (seen.time - memory.since >= until.time - 1e-6)
+            | (aligned & (memory.echo.believed <= until.wall))
+            | (jnp.isfinite(until.passes) & (here.distance >= coming))
+            | ((memory.stirred > 0) & (jnp.abs(estimate.yaw_rate) < until.yaw_rate))
+            | (estimate.vx >= until.speed)
+            | ((own.does == DRIFT) & (memory.drift.phase == drift_turn.STRAIGHT))
+        ) & (memory.begun > 0)
+        after = jnp.where(
+            open_ended,
+            jnp.minimum(memory.number + 1, count - 1),
+            (memory.number + 1) % count,
+        )
+        # Who believes its pose to half a metre, and is elsewhere, has missed a hand-over; and a
+        # condition that is met where the next has no place was something else's.
+        spread = estimate.pose_covariance
+        sure = spread.xx + spread.yy < ASTRAY**2
+        holds, inside = self._places(here.distance)
+        over = over & (after != memory.number) & (holds[after] | ~sure)
+        number = jnp.where(over, after, memory.number)
+        in_order = (number + 1 + jnp.arange(count)) % count
+        takes = in_order[jnp.argmax(inside[in_order])]
+        mends = sure & ~holds[number] & jnp.any(inside)
+        number = jnp.where(mends, takes, number)
+        return number, over | mends | (memory.begun == 0)
+
+    def _places(self, distance: Scalar) -> tuple[Array, Array]:
+        """(n,) whether each may hold at a distance, and whether it has its own place there."""
+        begin, end = jnp.asarray(self.policies.begin), jnp.asarray(self.policies.end)
+        everywhere = jnp.isinf(begin)
+        begin, end = jnp.where(everywhere, 0.0, begin), jnp.where(everywhere, 0.0, end)
+        whole = jnp.where(jnp.isinf(self.line.whole), 1e7, self.line.whole)
+        extent = jnp.mod(end - begin, whole)
+        inside = jnp.mod(distance - begin, whole) <= extent
+        near = jnp.mod(distance - begin + ASTRAY, whole) <= extent + 2 * ASTRAY
+        return everywhere | near, ~everywhere & inside
+
+    def _heard(self, memory: spikes.Memory, seen: Observation, dt: Scalar) -> spikes.Memory:
+        """What is ahead by the front sonar, without spikes."""
+        heard = seen.sonar[self.drift.front]
+        tick = jnp.where(heard.came(dt), memory.tick + 1, memory.tick)
+        nearer = dt * (jnp.abs(seen.estimate.vx) + REVERSE)
+        return spikes.update(memory, spikes.Reading(heard.value, tick), nearer, self.noise)
+
+    def _pursued(self, estimate: Estimate, here: Place) -> Scalar:
+        """Lock to a point of the centre line ahead: pure pursuit (Coulter 1992).
+
+        lock = atan(2 wheelbase sin(a) / l), with l and a the distance and the bearing of the point
+        from the rear axle.
+        """
+        ahead = AHEAD[0] + AHEAD[1] * jnp.maximum(estimate.vx, 0.0)
+        x, y = self.line.at(here.distance + ahead)
+        cosine, sine = jnp.cos(estimate.heading), jnp.sin(estimate.heading)
+        dx = x - estimate.x + self.rear_axle * cosine
+        dy = y - estimate.y + self.rear_axle * sine
+        left = cosine * dy - sine * dx
+        return jnp.arctan(2 * self.wheelbase * left / (dx**2 + dy**2 + 1e-4))
+
+
+class Key(NamedTuple):
+    """A number in a file: its range there, and what one of its unit is inside."""
+
+    low: float
+    high: float
+    unit: float = 1.0
+    never: float = math.inf  # what stands where it is not given
+
+
+DEGREE = math.pi / 180
+CONDITIONS = {
+    "driven_m": Key(0, 1e4),
+    "turned_deg": Key(-3600, 3600, DEGREE),
+    "time_s": Key(0, 1e4),
+    "wall_m": Key(0, 100, never=-math.inf),
+    "passes_m": Key(0, 1e5),
+    "yaw_rate_degps": Key(0, 1e4, DEGREE),
+    "speed_mps": Key(0, 100),
+}
+PLACE = {"from_m": Key(0, 1e5), "to_m": Key(0, 1e5)}
+ANYWHERE = {"turn_deg": Key(-180, 180, DEGREE), **PLACE}
+TAKES: dict[str, dict[str, Key]] = {
+    "straighten": {"speed_mps": Key(0.1, 20)},
+    "commands": {"throttle": Key(-1, 1), "steering_deg": Key(-90, 90, DEGREE)},
+    "drift": {},
+    "curve": {"speed_mps": Key(0.1, 20)},
+}
+LEAST_DRIFT = 20  # degrees
+Read = Callable[[Path], Mapping[str, np.ndarray]]  # of a commands.csv: time_s, throttle, steering
+
+
+def plan(
+    tables: Mapping[str, Any],
+    where: str,
+    course: Course,
+    car: Car,
+    read: Read,
+    speed: float | None = None,
+    laps: int = 1,
+) -> Plan:
+    """For a course and a nominal car, from the tables of a file that is called `where`.
+
+    `read` reads a file of commands; `speed` (m/s) is that of policies which name none. Raises
+    `InputError` naming file, policy, key and range.
+    """
+    if not len(course.line):
+        raise InputError(f"{course.name}: a plan needs a course with a centre line")
+    known = ("kind", "description", "policy")
+    for key in tables:
+        if key not in known:
+            raise unknown_key(where, key, dict.fromkeys(known))
+    rows = tables.get("policy")
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
+        raise InputError(f"{where}: a plan needs [[policy]] tables")
+    speed = drift_turn.SPEED if speed is None else speed
+    length = course.length
+    read_rows = [
+        _policy(row, f"{where}: policy {number}", speed, length, Path(where).parent, read)
+        for number, row in enumerate(rows, start=1)
+    ]
+    most = max(len(row.times) for row in read_rows)
+    padded = [
+        row._replace(
+            times=np.append(row.times, np.full(most - len(row.times), np.inf)),
+            throttle=np.append(row.throttle, np.zeros(most - len(row.throttle))),
+            steering=np.append(row.steering, np.zeros(most - len(row.steering))),
+        )
+        for row in read_rows
+    ]
+    # Its corners are the plan's to tell.
+    straight_on = dataclasses.replace(course, turns=(), closed=False)
+    drift = drift_turn.drift_turn(straight_on, car, speed, laps, by="wall")
+    return Plan(
+        policies=jax.tree.map(lambda *leaves: np.stack(leaves), *padded),
+        drift=dataclasses.replace(drift, linked=1.0),
+        line=line_of(course),
+        noise=car.sensors.sonar.noise,
+        wheelbase=car.body.wheelbase,
+        rear_axle=car.body.wheelbase - car.body.front_axle,
+    )
+
+
+def library() -> dict[str, str]:
+    """Names of the plans that come with the package, and what they say of themselves."""
+    names = sorted(p.name.removesuffix(".toml") for p in LIBRARY.iterdir())
+    tables = {name: read_toml(name, LIBRARY, "driver")[0] for name in names}
+    return {n: str(t["description"]) for n, t in tables.items() if t["kind"] == "plan"}
+
+
+def is_plan(name: str) -> bool:
+    """Whether a driver's name is a plan's: of the library, or a file of this kind."""
+    if name.endswith(".toml"):
+        return bool(read_toml(name, LIBRARY, "driver")[0].get("kind") == "plan")
+    return name in library()
+
+
+def load_plan(
+    name: str, course: Course, car: Car, read: Read, speed: float | None = None, laps: int = 1
+) -> Plan:
+    """A plan from the library or a file."""
+    tables, where = read_toml(name, LIBRARY, "driver")
+    if tables.get("kind") != "plan":
+        raise InputError(f'{where}: kind must be "plan", not {tables.get("kind")!r}')
+    return plan(tables, where, course, car, read, speed, laps)
+
+
+def _policy(
+    row: dict[str, Any], where: str, speed: float, length: float, folder: Path, read: Read
+) -> Policies:
+    """One table; `where` names file and policy, `folder` is that of the file."""
+    does = row.get("does")
+    if does not in NAMES:
+        raise InputError(f"{where}: does must be one of {', '.join(NAMES)}, not {does!r}")
+    takes = TAKES[does] | ANYWHERE
+    others = {"does": 0, "until": 0} | ({"commands": 0} if does == "commands" else {})
+    for key in row:
+        if key not in takes and key not in others:
+            raise unknown_key(where, key, {**takes, **others})
+    numbers = {key: _number(row, key, span, where) for key, span in takes.items()}
+    until = row.get("until", {})
+    if not isinstance(until, dict):
+        raise InputError(f"{where}: until must be a table such as {{ driven_m = 1.0 }}")
+    for key in until:
+        if key not in CONDITIONS:
+            raise unknown_key(where, f"until.{key}", {f"until.{k}": 0 for k in CONDITIONS})
+    conditions = [_number(until, key, span, where, "until.") for key, span in CONDITIONS.items()]
+    for name, table in (("", row), ("until.", until)):
+        for key in ("from_m", "to_m", "passes_m"):
+            if key in table and table[key] > length:
+                raise InputError(
+                    f"{where}: {name}{key} must be on the course, in [0, {length:g}], "
+                    f"not {table[key]!r}"
+                )
+    if ("from_m" in row) != ("to_m" in row):
+        raise InputError(f"{where}: from_m and to_m go together")
+    if does == "drift" and not abs(row.get("turn_deg", 0)) >= LEAST_DRIFT:
+        raise InputError(f"{where}: turn_deg must be in [{LEAST_DRIFT}, 180] to a side for a drift")
+    times, throttle, steering = np.zeros(1), np.zeros(1), np.zeros(1)
+    if does == "commands":
+        inline = [key for key in ("throttle", "steering_deg") if key in row]
+        if ("commands" in row) == bool(inline) or len(inline) == 1:
+            raise InputError(f"{where}: give throttle and steering_deg, or commands, a file")
+        if inline:
+            throttle = np.array([numbers["throttle"]])
+            steering = np.array([numbers["steering_deg"]])
+        else:
+            if not isinstance(row["commands"], str):
+                raise InputError(f"{where}: commands must be the path of a commands.csv")
+            played = read(folder / row["commands"])
+            times = np.asarray(played["time_s"]) - played["time_s"][0]
+            throttle, steering = np.asarray(played["throttle"]), np.asarray(played["steering"])
+    return Policies(
+        does=np.array(NAMES.index(does)),
+        speed=np.array(numbers["speed_mps"] if "speed_mps" in row else speed),
+        angle=np.array(numbers["turn_deg"] if "turn_deg" in row else 0.0),
+        begin=np.array(numbers["from_m"]),
+        end=np.array(numbers["to_m"]),
+        until=Until(*map(np.array, conditions)),
+        times=times,
+        throttle=throttle,
+        steering=steering,
+    )
+
+
+def _number(table: dict[str, Any], key: str, span: Key, where: str, path: str = "") -> float:
+    """A number in the units used inside, or what stands for none."""
+    if key not in table:
+        return span.never
+    value = table[key]
+    bad = isinstance(value, bool) or not isinstance(value, int | float)
+    if bad or not span.low <= value <= span.high:
+        raise InputError(
+            f"{where}: {path}{key} must be a number in [{span.low:g}, {span.high:g}], not {value!r}"
+        )
+    return float(value) * span.unit
