@@ -250,8 +250,11 @@ def drift_turn(
     laps: int = 1,
     turning: Turning = DEFAULT,
     stop_angle: StopAngle = STOPS,
+    by: str = "filter",
 ) -> DriftTurn:
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
+
+    `by` is what it straightens by, as in `Straighten`.
 
     Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
     """
@@ -265,7 +268,7 @@ def drift_turn(
     sonar = car.sensors.sonar
     front = straighten.mount_number(car, "front")
     return DriftTurn(
-        straight=straighten.straighten(course, car, SPEED if speed is None else speed),
+        straight=straighten.straighten(course, car, SPEED if speed is None else speed, by),
         turning=turning,
         stop_angle=stop_angle,
         angles=np.array([t.angle for t in turns] + [0.0]),

@@ -1,0 +1,324 @@
+"""What the estimates are worth, and the drives on them: `make estimation` writes the page.
+
+All in closed loop, with the drift-turn driver on the velocity filter, over cars of a set that
+differ from the nominal one. Four studies, each a function that gives the lines of its section:
+the errors of the filters, sensors that fail on a straight, straightening by sonar and by filter,
+and what better sensors would bring.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.stats import chi2
+
+from countersteer.car.car import Car
+from countersteer.car.files import load_car
+from countersteer.course.course import Course
+from countersteer.course.files import load_course
+from countersteer.drivers.driver import Driver
+from countersteer.drivers.drift_turn import drift_turn
+from countersteer.drivers.straighten import straighten
+from countersteer.estimation.pose import PoseFilter
+from countersteer.evaluation.evaluate import Trials, interval, results
+from countersteer.evaluation.population import Drawn, draw, load_population
+from countersteer.evaluation.rollout import LATE, LOOK, LOST, REACHED, STALLED, TOUCHED, Score
+from countersteer.evaluation.watches import PARTICLES, SAMPLE, Errors, Places, anywhere, corridors
+from countersteer.link.link import ONBOARD
+from countersteer.sensing.faults import KINDS, Fault
+from countersteer.simulator import keep_programs, padded
+from countersteer.world import battery
+
+SET, SPEEDS, COURSES = "around", (1.5, 3.0), ("box", "ess")
+CARS = 256  # of each course
+FAULT = 0.5  # s that a sensor fails
+FAILING = 8  # cars for each sensor, kind and straight
+SENSORS = (
+    "sonar_front",
+    "sonar_left",
+    "sonar_right",
+    "encoder",
+    "gyroscope",
+    "accelerometer",
+    "voltmeter",
+)
+NAMES = {"box": (4, "its four places"), "ess": (1, "the one place")}
+Make = Callable[[Course, Car, float | None], Driver]
+
+
+def trials(course: Course, car: Car, seeds: Sequence[int]) -> Trials:
+    """The trials that all studies are made of."""
+    return Trials(course, car, load_population(SET), seeds, SPEEDS, 1, ONBOARD, "filter", 0.001)
+
+
+def drawn(of: Trials) -> Drawn:
+    """What they draw."""
+    return draw(of.population, of.car, of.course, of.seeds, np.float32, of.speeds)
+
+
+def rms(values: Any) -> float:
+    """Root of the mean square, of what is a number."""
+    return math.sqrt(float(np.nanmean(np.square(np.asarray(values, float)))))
+
+
+def errors(course: Course, car: Car, seeds: Sequence[int], make: Make = drift_turn) -> Any:
+    """Scores, and what `watches.Errors` has kept, of one drive for each seed."""
+    watch = Errors(
+        corridors=corridors(course, 1, np.float32), inside=np.float32(chi2.ppf(0.95, 3))
+    )
+    return trials(course, car, seeds).watched(partial(make, course, car), watch)
+
+
+def figures(of: Trials, kept: Any) -> dict[str, float]:
+    """The filters' errors over all trials, in the units of the page."""
+    draws, nominal = drawn(of), of.car
+    cars, told = draws.cars, kept.estimate
+    each = np.nanmean(kept.squares, axis=1)  # of a trial
+    full = np.asarray(nominal.battery.full)
+    voltage = np.asarray(jax.vmap(battery.open_circuit)(cars.battery, kept.charge))
+    resistance = np.asarray(jax.vmap(battery.resistance)(cars.battery))
+    friction = cars.tires.rear.friction / nominal.tires.rear.friction
+    bias = cars.sensors.gyroscope.bias
+
+    def per(total: np.ndarray, count: np.ndarray) -> float:
+        return math.sqrt(float(np.sum(total)) / max(float(np.sum(count)), 1.0))
+
+    # A car's errors hang together over a drive, so a drive counts as one draw of three.
+    low, high = chi2.ppf([0.025, 0.975], 3 * len(each)) / len(each)
+    return {
+        "drives": len(each),
+        "drifting_s": LOOK * float(np.sum(kept.drifting)),
+        "sideslip_deg": math.degrees(per(kept.slip, kept.drifting)),
+        "reckoned_deg": math.degrees(per(kept.reckoned, kept.drifting)),
+        "normalised": float(np.nanmean(each)),
+        "normalised_low": low,
+        "normalised_high": high,
+        "inside": float(np.sum(kept.inside) / np.sum(kept.looks)),
+        "gyro_bias_degps": math.degrees(rms(told.gyro_bias - bias)),
+        "gyro_bias_spread_degps": math.degrees(rms(bias - nominal.sensors.gyroscope.bias)),
+        "friction": rms(told.friction - friction),
+        "friction_spread": rms(friction - 1),
+        "battery_v": rms(told.battery * full - voltage),
+        "battery_spread_v": float(np.std(voltage)),
+        "resistance_ohm": rms(told.battery_resistance - resistance),
+        "resistance_spread_ohm": float(np.std(resistance)),
+        "offset_mm": 1e3 * per(kept.offset_error, kept.straight),
+        "angle_deg": math.degrees(per(kept.angle_error, kept.straight)),
+        "offset_normal": per(kept.offset_normal, kept.straight) ** 2,
+        "angle_normal": per(kept.angle_normal, kept.straight) ** 2,
+        "pings": float(np.sum(kept.pings)),
+        "alarms": float(np.sum(kept.alarms)),
+        "doubts": float(np.sum(kept.doubts)),
+        "strays": float(np.sum(kept.strays)),
+        "passed": float(np.sum(kept.passed)),
+    }
+
+
+def filters(car: Car, seeds: Sequence[int], picture: Path | None) -> list[str]:
+    """The filters' errors."""
+    found, squares = {}, {}
+    for name in COURSES:
+        course = load_course(name)
+        _, kept = errors(course, car, seeds)
+        found[name] = figures(trials(course, car, seeds), kept)
+        squares[name] = kept.squares
+        print(name, found[name], flush=True)
+    rows: list[tuple[str, Callable[[dict[str, float]], str]]] = [
+        (
+            "sideslip in drifts (over 10°), RMS error",
+            lambda f: f"**{f['sideslip_deg']:.1f}°** over {f['drifting_s']:.0f} s",
+        ),
+        ("the same by dead reckoning", lambda f: f"{f['reckoned_deg']:.1f}°"),
+        (
+            "(vx, vy, yaw rate): normalised error squared, mean; 95 % bounds",
+            lambda f: f"{f['normalised']:.2f}; {f['normalised_low']:.2f} to "
+            f"{f['normalised_high']:.2f}",
+        ),
+        ("instants within the covariance's 95 %", lambda f: f"{100 * f['inside']:.1f} %"),
+        *(
+            (
+                f"{name} at the end, RMS error (and spread of the cars)",
+                lambda f, key=key, unit=unit, form=form: f"{f[f'{key}{unit}']:{form}} "
+                f"({f[f'{key}_spread{unit}']:{form}})",
+            )
+            for name, key, unit, form in (
+                ("gyroscope's bias, °/s", "gyro_bias", "_degps", ".2f"),
+                ("friction of the rear axle over the nominal", "friction", "", ".3f"),
+                ("open-circuit voltage, V", "battery", "_v", ".3f"),
+                ("battery's resistance, ohm", "resistance", "_ohm", ".4f"),
+            )
+        ),
+        ("offset from the corridor's middle, RMS error", lambda f: f"{f['offset_mm']:.0f} mm"),
+        ("angle to the corridor, RMS error", lambda f: f"{f['angle_deg']:.2f}°"),
+        (
+            "these two squared over their variance, mean (1 agrees)",
+            lambda f: f"{f['offset_normal']:.2f}, {f['angle_normal']:.2f}",
+        ),
+        (
+            "front pings of the right wall held for spikes (by the driver's own gate)",
+            lambda f: f"{100 * f['alarms'] / f['pings']:.2f} % "
+            f"({100 * f['doubts'] / f['pings']:.2f} %) of {f['pings']:.0f}",
+        ),
+        (
+            "pings that are too short, believed",
+            lambda f: f"{f['passed']:.0f} of {f['strays']:.0f}",
+        ),
+    ]
+    lines = ["| | " + " | ".join(f"`{name}`" for name in COURSES) + " |"]
+    lines += ["| --- |" + " ---: |" * len(COURSES)]
+    lines += [f"| {name} | " + " | ".join(map(say, found.values())) + " |" for name, say in rows]
+    if picture is not None:
+        draw_picture(squares, picture)
+    return lines
+
+
+def poses(car: Car, seeds: Sequence[int]) -> list[str]:
+    """The pose from a uniform start."""
+    lines = [
+        "| course | drives of two turns | settled, up to symmetry (95 %) | at the one place | "
+        "median share of the weight |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for name in COURSES:
+        course = load_course(name)
+        placed, two = settled(course, car, seeds)
+        near = (placed.distance < 0.3) & (placed.angle < math.radians(15))
+        near = near[two]
+        count, alike = len(near), int(np.sum(np.any(near, axis=1)))
+        low, high = interval(alike, count)
+        lines.append(
+            f"| `{name}` | {count} | {100 * alike / count:.1f} % ({100 * low:.1f}–{100 * high:.1f})"
+            f" | {100 * np.mean(near[:, 0]):.1f} % | {np.median(placed.share[two]):.2f} |"
+        )
+        print(lines[-1], flush=True)
+    return lines
+
+
+def settled(course: Course, car: Car, seeds: Sequence[int]) -> tuple[Any, np.ndarray]:
+    """What `watches.Places` has kept, and which drives made two turns."""
+    place = PoseFilter(walls=padded(course.walls, np.float32), sonar=car.sensors.sonar)
+    place = jax.tree.map(np.float32, place)
+    alike = NAMES.get(course.name, (1, ""))[0]
+    low, high = (getattr(np, f"nan{end}")(course.walls.reshape(-1, 2), 0) for end in ("min", "max"))
+    watch = Places(
+        place=place,
+        uniform=anywhere(course, place, 20 * PARTICLES),
+        middle=((low + high) / 2).astype(np.float32),
+        turns=(np.arange(alike) * 2 * math.pi / alike).astype(np.float32),
+    )
+    score, placed = trials(course, car, seeds).watched(partial(drift_turn, course, car), watch)
+    return placed, np.isfinite(score.turns.end[:, 1])
+
+
+def failing(
+    course: Course, car: Car, cars: int, sensors: Sequence[str] = SENSORS
+) -> dict[tuple[str, str], np.ndarray]:
+    """(cars, straights) of statuses for each sensor and kind; and ("none", "") without a fault.
+
+    A fault begins 0.4 s after the start, or as a turn ends, and lasts half a second. One program
+    holds all faults, each of no duration but in its own trials.
+    """
+    pairs = [(sensor, kind) for sensor in sensors for kind in KINDS]
+    count = len(course.turns_ahead(1))
+
+    def run(which: np.ndarray, starts: np.ndarray, seeds: np.ndarray) -> Score:
+        faults = tuple(
+            Fault(sensor=s, kind=k, start=starts, duration=np.where(which == i, FAULT, 0.0))
+            for i, (s, k) in enumerate(pairs)
+        )
+        own = trials(course, car, seeds.tolist())
+        return own.watched(partial(drift_turn, course, car), None, faults=faults)[0]
+
+    seeds = np.arange(cars)
+    none = np.full(cars, -1)
+    sound = run(none, 0.0 * none, seeds)
+    begins = np.concatenate([np.full((cars, 1), 0.4), sound.turns.end[:, : count - 1]], axis=1)
+    # A straight that the sound car never came to has no fault.
+    begins = np.where(np.isfinite(begins), begins, 1e6)
+    shape = (len(pairs), cars, count)
+    which, car_number, straight = (axis.ravel() for axis in np.indices(shape))
+    score = run(which, begins[car_number, straight], seeds[car_number])
+    status = score.status.reshape(shape)
+    found = {pair: status[i] for i, pair in enumerate(pairs)}
+    return found | {("none", ""): np.repeat(sound.status[:, None], count, axis=1)}
+
+
+def sensor_faults(car: Car, cars: int) -> list[str]:
+    """Sensors that fail on a straight of `box`."""
+    found = failing(load_course("box"), car, cars)
+    lines = ["| sensor | " + " | ".join(KINDS) + " |", "| --- |" + " ---: |" * len(KINDS)]
+
+    def say(status: np.ndarray) -> str:
+        goal, stops = np.sum(status == REACHED), np.sum((status == STALLED) | (status == LATE))
+        touched, lost = np.sum(status == TOUCHED), np.sum(status == LOST)
+        rest = f", {stops} stop" if stops else ""
+        rest += f", **{touched} touch**" if touched else ""
+        rest += f", **{lost} lost**" if lost else ""
+        return f"{goal} of {status.size}{rest}"
+
+    for sensor in SENSORS:
+        told = " | ".join(say(found[sensor, kind]) for kind in KINDS)
+        lines.append(f"| {sensor.replace('_', ', ')} | {told} |")
+        print(lines[-1], flush=True)
+        for kind in KINDS:
+            touched = np.argwhere(found[sensor, kind] == TOUCHED)
+            if len(touched):
+                print(" ", kind, "seed and straight:", touched.tolist(), flush=True)
+    lines.append(f"| none | {say(found['none', ''][:, :1])} | | |")
+    return lines
+
+
+def straightening(car: Car, seeds: Sequence[int]) -> list[str]:
+    """PID on sonar beside the wall filter."""
+    lines = [
+        "| | offset, RMS | angle, RMS | as known: offset | angle | success | heading error, RMS |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for where, make in (("straight", straighten), ("box", drift_turn), ("ess", drift_turn)):
+        course = load_course(where)
+        for by in ("sonar", "filter"):
+            score, kept = errors(course, car, seeds, partial(make, by=by))
+            count = np.sum(kept.straight)
+            offset, angle, offset_error, angle_error = (
+                math.sqrt(np.sum(total) / count)
+                for total in (kept.offset, kept.angle, kept.offset_error, kept.angle_error)
+            )
+            told = results(score, seeds)
+            error = told["heading_error_rms_deg"]
+            lines.append(
+                f"| `{where}`, by {by} | {1e3 * offset:.0f} mm | {math.degrees(angle):.2f}° | "
+                f"{1e3 * offset_error:.0f} mm | {math.degrees(angle_error):.2f}° | "
+                f"{100 * told['success_rate']:.1f} % | {'' if error is None else f'{error:.2f}°'} |"
+            )
+            print(lines[-1], flush=True)
+    return lines
+
+
+def draw_picture(squares: dict[str, np.ndarray], path: Path) -> None:
+    """The normalised error squared over time, a dot an instant, between its bounds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(squares), figsize=(10, 3.4), layout="constrained")
+    for one, (name, table) in zip(np.atleast_1d(axes), squares.items(), strict=True):
+        number = np.sum(np.isfinite(table), axis=0)
+        many = number >= len(table) / 2
+        time, count = LOOK * SAMPLE * np.arange(table.shape[1])[many], number[many]
+        bounds = chi2.ppf(np.array([[0.025], [0.975]]), 3 * count) / count
+        one.fill_between(time, *bounds, alpha=0.25, label="95 % bounds of the mean")
+        one.plot(time, np.nanmean(table[:, many], axis=0), ".-", markersize=3, label="mean")
+        one.plot(time, np.nanmedian(table[:, many], axis=0), lw=0.8, color="grey", label="median")
+        one.set_title(name, fontsize=10)
+        one.set_xlabel("time, s")
+        one.set_ylim(0, None)
+    axes[0].set_ylabel("normalised error squared")
+    axes[0].legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
