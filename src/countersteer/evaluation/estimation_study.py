@@ -99,6 +99,10 @@ def figures(of: Trials, kept: Any) -> dict[str, float]:
         "normalised_low": low,
         "normalised_high": high,
         "inside": float(np.sum(kept.inside) / np.sum(kept.looks)),
+        **{
+            f"{name}_normal": float(np.sum(total) / np.sum(kept.looks))
+            for name, total in zip(("vx", "vy", "yaw_rate"), kept.alone, strict=True)
+        },
         "gyro_bias_degps": math.degrees(rms(told.gyro_bias - bias)),
         "gyro_bias_spread_degps": math.degrees(rms(bias - nominal.sensors.gyroscope.bias)),
         "friction": rms(told.friction - friction),
@@ -138,6 +142,10 @@ def filters(car: Car, seeds: Sequence[int], picture: Path | None) -> list[str]:
             "(vx, vy, yaw rate): normalised error squared, mean; 95 % bounds",
             lambda f: f"{f['normalised']:.2f}; {f['normalised_low']:.2f} to "
             f"{f['normalised_high']:.2f}",
+        ),
+        (
+            "each alone: vx, vy, yaw rate (1 agrees)",
+            lambda f: f"{f['vx_normal']:.2f}, {f['vy_normal']:.2f}, {f['yaw_rate_normal']:.2f}",
         ),
         ("instants within the covariance's 95 %", lambda f: f"{100 * f['inside']:.1f} %"),
         *(

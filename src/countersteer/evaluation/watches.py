@@ -63,6 +63,7 @@ class Kept(NamedTuple):
     reckoned: Scalar  # the same of dead reckoning
     looks: Scalar
     inside: Scalar  # of them within the 95 % of the covariance
+    alone: tuple[Scalar, ...]  # squared errors of vx, vy, yaw rate over each one's variance
     squares: Array  # (SAMPLES,) normalised error squared of vx, vy, yaw rate; NaN: none
     straight: Scalar  # looks on straights
     offset_error: Scalar  # squared, of the driver's offset and angle to its corridor
@@ -103,6 +104,7 @@ class Errors:
         )
         return Kept(
             *[zero] * 5,
+            (zero,) * 3,
             jnp.full(SAMPLES, jnp.nan, dtype),
             *[zero] * 12,
             told,
@@ -168,6 +170,12 @@ class Errors:
             kept.reckoned + drifts * square(reckoning.estimate),
             kept.looks + looked,
             kept.inside + looked * (normal < self.inside),
+            tuple(
+                sum_ + looked * error**2 / variance
+                for sum_, error, variance in zip(
+                    kept.alone, off, told.velocity_covariance[:3], strict=True
+                )
+            ),
             squares,
             kept.straight + straight,
             kept.offset_error + straight * offset_error,
