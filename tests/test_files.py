@@ -369,6 +369,8 @@ def completions(tmp_path_factory):
         (("drive", "box", "--link", ""), "onboard radio"),
         (("drive", "box", "--set", "servo.limit_l"), "servo.limit_left_deg="),
         (("list", "para"), "parameters"),
+        (("trials", "tu"), "turns"),
+        (("trials", "turns", "--car", "rx"), "rx7"),
         (("replay", "comp"), "completion"),
     ],
 )

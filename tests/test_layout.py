@@ -23,8 +23,12 @@ MAY_IMPORT = {
     "runs": {"car", "course"},
     "tuning": {"car", "world", "sensing", "runs"},
     "evaluation": {
-        "car", "course", "world", "sensing", "simulator", "runs", "tuning",
+        "car", "course", "world", "sensing", "link", "simulator", "runs", "tuning", "estimation",
         "drivers",  # the bench times a drive, so it needs one that drives
+    },
+    "learning": {
+        "car", "course", "simulator", "runs", "evaluation",
+        "drivers",  # what is learned is a driver's numbers
     },
     "viewing": {"car", "runs", "simulator"},  # a car is drawn to its size
     "listing": {"car", "course"},

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 DRIVERS = ("drift-turn", "straighten")
+EXPERIMENTS = (
+    "turn-rate", "drift-threshold", "stop-time", "drift-turn", "control-rate", "battery",
+    "narrowest-corner",
+)  # fmt: skip
 LONGEST_REPLAY = 3600.0  # s
 FASTEST_GIF = 50  # frames a second
 
@@ -59,6 +63,16 @@ def speeds(text: str) -> tuple[float, float]:
     return ends
 
 
+def charges(text: str) -> tuple[float, float]:
+    """A range of charge LO:HI, or one."""
+    low, _, high = text.partition(":")
+    read = number(0, 1)
+    ends = (read(low), read(high or low))
+    if ends[0] > ends[1]:
+        raise argparse.ArgumentTypeError(f"must rise, not {text}")
+    return ends
+
+
 def parser() -> Parser:
     """All verbs with their options."""
     top = Parser(prog="countersteer", description="Makes a radio-controlled car drift by itself.")
@@ -70,6 +84,29 @@ def parser() -> Parser:
         made.add_argument("--json", action="store_true", help="one JSON object, nothing else")
         made.set_defaults(run=run)
         return made
+
+    def group(name: str, does: str, metavar: str) -> Callable[..., Parser]:
+        """A verb of several things, each with options of its own."""
+        made = verbs.add_parser(name, help=does, description=does)
+        kinds = made.add_subparsers(dest="what", metavar=metavar, required=True, help=does)
+
+        def kind(name: str, does: str, run: Callable[[argparse.Namespace], int]) -> Parser:
+            part: Parser = kinds.add_parser(name, help=does, description=does)
+            part.add_argument("--json", action="store_true", help="one JSON object, nothing else")
+            part.set_defaults(run=run)
+            return part
+
+        return kind
+
+    def nominal_car(made: Parser) -> None:
+        made.add_argument("--car", default="rx7", help="library name or .toml file (default rx7)")
+        made.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="PATH=VALUE",
+            help="override a parameter of the car (repeatable)",
+        )
 
     def physics(made: Parser, car: str | None) -> None:
         default = f"default {car}" if car else "default the run's own, else rx7"
@@ -126,7 +163,7 @@ def parser() -> Parser:
     drive.add_argument(
         "--driver",
         default="drift-turn",
-        help=f"{', '.join(DRIVERS)}, or a commands.csv (default drift-turn)",
+        help=f"{', '.join(DRIVERS)}, a policy .toml, or a commands.csv (default drift-turn)",
     )
     physics(drive, "rx7")
     drive.add_argument(
@@ -212,31 +249,105 @@ def parser() -> Parser:
         "--out", type=Path, required=True, metavar="DIR", help="folder of the run folders"
     )
 
-    trials = verb("trials", "commands for a series of drives", run_trials)
-    trials.add_argument(
-        "what",
-        choices=("throttle-steps",),
-        help="throttle-steps: from rest, straight, each a second at one throttle, then none",
+    trials = group("trials", "many drives, or commands for them", "WHAT")
+    steps = trials(
+        "throttle-steps",
+        "commands: from rest, straight, each a second at one throttle, then none",
+        run_trials,
     )
-    trials.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of the files"
-    )
-    trials.add_argument(
+    steps.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the files")
+    steps.add_argument(
         "--levels", metavar="LIST", help="throttles, such as 0.2,0.5 (default ten, 0.1 to 1)"
     )
-    trials.add_argument(
+    steps.add_argument(
         "--duration-s",
         type=number(0.01, 60),
         default=1.0,
         metavar="S",
         help="at each throttle (default 1)",
     )
-    trials.add_argument(
+    steps.add_argument(
         "--rate-hz",
         type=number(1, 1000),
         default=100.0,
         metavar="HZ",
         help="rows a second (default 100)",
+    )
+    turns = trials(
+        "turns",
+        "turns in the open, stopped at different yaw rates: time and angle until stopped",
+        run_turns,
+    )
+    nominal_car(turns)
+    turns.add_argument(
+        "--cars", metavar="SET", help="draw each trial's car from this set (default the car itself)"
+    )
+    turns.add_argument(
+        "--trials", type=number(1, 10**6, int), default=1000, metavar="N", help="default 1000"
+    )
+    turns.add_argument(
+        "--speed-mps", type=speeds, default=(1.0, 3.0), metavar="LO:HI", help="default 1:3"
+    )
+    turns.add_argument(
+        "--battery",
+        type=charges,
+        default=None,
+        metavar="LO:HI",
+        help="charge, 0 to 1 (default the set's, or 0.3:1)",
+    )
+    turns.add_argument(
+        "--driver", default="drift-turn", metavar="POLICY", help="whose turns (default drift-turn)"
+    )
+    turns.add_argument("--seed", type=number(0, 2**31 - 1, int), default=0, help="default 0")
+    turns.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
+    turns.add_argument(
+        "--from",
+        dest="runs",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUN",
+        help="find the turns in these runs' folders instead, of a real car or a simulated one",
+    )
+
+    experiment = verb("experiment", "the paper's measurements", run_experiment)
+    experiment.add_argument(
+        "name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS)
+    )
+    nominal_car(experiment)
+    experiment.add_argument(
+        "--from",
+        dest="runs",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUN",
+        help="measure in these runs' folders instead, of a real car or a simulated one",
+    )
+    experiment.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
+
+    learn = group("learn", "experience to a driver's numbers", "METHOD")
+    stop = learn(
+        "stop-angle",
+        "how far a car still turns once it is stopped: lines over the yaw rate, by speed",
+        run_learn_stop_angle,
+    )
+    stop.add_argument(
+        "sources",
+        nargs="+",
+        type=Path,
+        metavar="TABLE_OR_RUN",
+        help="a turns.csv, the folder of trials turns, or a run's folder",
+    )
+    stop.add_argument(
+        "--out", type=Path, required=True, metavar="POLICY.toml", help="where the policy is written"
+    )
+    stop.add_argument(
+        "--most-deg",
+        type=number(1, 360),
+        default=90.0,
+        metavar="DEG",
+        help="leave out turns that ran on for more than this (default 90)",
     )
 
     tune = verb("tune", "logs of a car to the car's numbers", run_tune)
@@ -372,7 +483,8 @@ def run_drive(options: argparse.Namespace) -> int:
         if most != speed:
             raise InputError("--speed-mps LO:HI: a range is drawn from with --cars only")
     driver = make_driver(options.driver, course, load_car(options.car), speed, options.laps)
-    name = Path(options.driver).stem if options.driver.endswith(".csv") else options.driver
+    made = options.driver.endswith((".csv", ".toml"))
+    name = Path(options.driver).stem if made else options.driver
     simulator = Simulator(
         course,
         car,
@@ -732,6 +844,99 @@ def run_trials(options: argparse.Namespace) -> int:
     return DONE
 
 
+def run_turns(options: argparse.Namespace) -> int:
+    """`trials turns`."""
+    from countersteer.car.files import load_car
+    from countersteer.drivers.policy import load_policy
+    from countersteer.evaluation import open_turns
+    from countersteer.evaluation.population import load_population
+    from countersteer.runs.writer import new_folder
+    from countersteer.simulator import keep_programs
+
+    if options.runs:
+        rows = [row for path in options.runs for row in open_turns.of_run(path)]
+        tried, title = None, ", ".join(path.name for path in options.runs[:2])
+        title += f" and {len(options.runs) - 2} more" if len(options.runs) > 2 else ""
+    else:
+        keep_programs(cores=os.cpu_count() or 1)
+        car, turning = load_car(options.car, options.set), load_policy(options.driver).turning
+        cars = load_population(options.cars) if options.cars else None
+        charge = options.battery or (None if cars else (0.3, 1.0))
+        seeds = range(options.seed, options.seed + options.trials)
+        with Progress(options.json) as progress:
+            rows = open_turns.trial(
+                car, turning, cars, seeds, options.speed_mps, charge, progress.show
+            )
+        tried, title = options.trials, f"{options.car}, {options.trials} turns"
+    table = open_turns.as_table(rows)
+    folder = new_folder(options.out, "turns")
+    open_turns.write_rows(folder / "turns.csv", rows)
+    open_turns.draw_turns(table, folder / "turns.png", title)
+    result: dict[str, Any] = (
+        {"car": options.car} if tried else {"runs": [str(path) for path in options.runs]}
+    )
+    result |= open_turns.summary(table, tried)
+    (folder / "turns.json").write_text(json.dumps(result, indent=1) + "\n")
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+        return DONE
+    print(f"{len(rows)} turns that were stopped; low, median, high:")
+    for name in open_turns.COLUMNS[1:7]:
+        ends = result[name]
+        if ends:
+            print(f"  {name:20}" + "".join(f"{ends[k]:10.2f}" for k in ("low", "median", "high")))
+    print(f"table: {folder / 'turns.csv'}; picture: {folder / 'turns.png'}")
+    return DONE
+
+
+def run_experiment(options: argparse.Namespace) -> int:
+    """`experiment`."""
+    from countersteer.car.files import load_car
+    from countersteer.evaluation import experiments
+    from countersteer.evaluation.experiments.found import write
+    from countersteer.runs.run import read_run
+    from countersteer.runs.writer import new_folder
+    from countersteer.simulator import keep_programs
+
+    # Only the closed loop is worth its time in a compiler that makes a function of it.
+    keep_programs(blocks=options.name == "control-rate", cores=os.cpu_count() or 1)
+    module, car = experiments.load(options.name), load_car(options.car, options.set)
+    if options.runs and not hasattr(module, "measure"):
+        raise InputError(f"--from: {options.name} is simulated, and measures no run")
+    with Progress(options.json) as progress:
+        if options.runs:
+            found = module.measure([read_run(path) for path in options.runs])
+        else:
+            found = module.simulate(car, Path(options.car).stem, progress.show)
+    folder = new_folder(options.out, options.name)
+    result = write(found, folder, options.name)
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+    else:
+        print(f"{found.text}\ntable, picture: {folder}")
+    return DONE
+
+
+def run_learn_stop_angle(options: argparse.Namespace) -> int:
+    """`learn stop-angle`."""
+    from countersteer.evaluation import stop_regression
+    from countersteer.learning.stop_angle import learn
+
+    if options.out.suffix != ".toml":
+        raise InputError(f"--out {options.out}: name a .toml file")
+    found = learn(options.sources, math.radians(options.most_deg), options.out)
+    result, picture = stop_regression.about(found), options.out.with_suffix(".png")
+    options.out.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+    names = ", ".join(path.name for path in options.sources)
+    stop_regression.draw(found, picture, f"{result['turns']} turns of {names}"[:90])
+    if options.json:
+        print(json.dumps(result | {"policy": str(options.out), "picture": str(picture)}))
+        return DONE
+    print("\n".join(stop_regression.lines(result)))
+    print(f"policy: {options.out}; picture: {picture}")
+    return DONE
+
+
 def run_export(options: argparse.Namespace) -> int:
     """`export`."""
     from countersteer.runs.run import read_run
@@ -820,8 +1025,9 @@ def run_completion(options: argparse.Namespace) -> int:
 def make_driver(
     name: str, course: "Course", car: "Car", speed: float | None, laps: int
 ) -> "Driver":
-    """A driver from the library, or one that replays a `commands.csv`."""
+    """A driver from the library or a policy, or one that replays a `commands.csv`."""
     from countersteer.drivers.drift_turn import drift_turn
+    from countersteer.drivers.policy import load_policy
     from countersteer.drivers.replay import Replay
     from countersteer.drivers.straighten import straighten
     from countersteer.runs.files import read_commands
@@ -833,11 +1039,13 @@ def make_driver(
         return Replay(
             times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
         )
-    if name == "drift-turn":
-        return drift_turn(course, car, speed, laps)
+    if name == "drift-turn" or name.endswith(".toml"):
+        return drift_turn(course, car, speed, laps, *load_policy(name))
     if name == "straighten":
         return straighten(course, car, speed)
-    raise InputError(f"no driver {name}: give one of {', '.join(DRIVERS)}, or a commands.csv")
+    raise InputError(
+        f"no driver {name}: give one of {', '.join(DRIVERS)}, a policy .toml or a commands.csv"
+    )
 
 
 INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.car.parameter import Scalar, pytree
 from countersteer.course.course import Course
-from countersteer.drivers import straighten
+from countersteer.drivers import policy, straighten
 from countersteer.drivers.driver import Command, Observation, paced
 from countersteer.drivers.stop_angle import StopAngle, interpolate
 from countersteer.drivers.straighten import Straighten
+from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
 
 STRAIGHT, SPIN, STOP, SETTLE = 0, 1, 2, 3
@@ -51,40 +52,6 @@ class Memory(NamedTuple):
     def command(self) -> Command:
         """The last."""
         return self.straight.command
-
-
-@pytree
-class Turning:
-    """How a turn is driven: commands over yaw rate and heading.
-
-    Tables hold a number for each of the `speeds` of entry; between them they are interpolated.
-    """
-
-    speeds: Array  # m/s
-    lead: Array  # distance to the corner at which a turn by 90° is begun, m
-    lock: Array  # rad
-    rate: Array  # yaw rate that the spin is held at by the lock, rad/s
-    throttle: Array
-    counter: Array  # lock while stopping, rad
-    rate_gain: Scalar  # lock per yaw rate that is missing, s
-    stop_gain: Scalar  # lock given back per angle that would be missing, rad/rad
-    settled: Scalar  # yaw rate (rad/s) under which the heading is held
-    hold_p: Scalar  # lock per heading error while it settles, rad/rad
-    hold_d: Scalar  # lock per yaw rate, s
-    hold_slip: Scalar  # part of the front wheels' sideslip that they follow
-    hold_throttle: Scalar  # throttle while it settles
-
-    def spin(self, entry: Scalar, rate: Scalar) -> Command:
-        """Wheels over, throttle high: for a left turn. `rate` is the yaw rate."""
-        lock = interpolate(self.speeds, self.lock, entry)
-        held = interpolate(self.speeds, self.rate, entry)
-        throttle = interpolate(self.speeds, self.throttle, entry)
-        return Command(throttle, lock + self.rate_gain * (held - rate))
-
-    def stop(self, entry: Scalar, missing: Scalar) -> Command:
-        """Wheels back, throttle none: for a left turn of which so much angle would be missing."""
-        counter = interpolate(self.speeds, self.counter, entry)
-        return Command(0.0 * counter, self.stop_gain * missing - counter)
 
 
 @pytree
@@ -220,41 +187,19 @@ class DriftTurn:
         return corner + gain * news, (1 - gain) * doubt, spikes
 
 
-DEFAULT = Turning(
-    speeds=np.array([1.4, 1.9, 2.4]),
-    lead=np.array([0.55, 0.76, 1.0]),
-    lock=np.array([0.4, 0.37, 0.25]),
-    rate=np.array([4.0, 3.4, 3.4]),
-    throttle=np.array([1.0, 0.7, 0.6]),
-    counter=np.array([0.45, 0.45, 0.45]),
-    rate_gain=0.24,
-    stop_gain=0.5,
-    settled=1.2,
-    hold_p=0.9,
-    hold_d=0.1,
-    hold_slip=0.5,
-    hold_throttle=0.15,
-)
-STOPS = StopAngle(
-    speeds=np.array([1.0, 1.6, 2.2]),
-    offset=np.zeros(3),
-    slope=np.full(3, 0.12),
-    deviation=np.full(3, 0.1),
-)
-
-
 def drift_turn(
     course: Course,
     car: Car,
     speed: float | None = None,
     laps: int = 1,
-    turning: Turning = DEFAULT,
-    stop_angle: StopAngle = STOPS,
+    turning: Turning | None = None,
+    stop_angle: StopAngle | None = None,
     by: str = "filter",
 ) -> DriftTurn:
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
 
-    `by` is what it straightens by, as in `Straighten`.
+    Laws that are not given are those of the library's policy. `by` is what it straightens by, as in
+    `Straighten`.
 
     Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
     """
@@ -269,8 +214,8 @@ def drift_turn(
     front = straighten.mount_number(car, "front")
     return DriftTurn(
         straight=straighten.straighten(course, car, SPEED if speed is None else speed, by),
-        turning=turning,
-        stop_angle=stop_angle,
+        turning=turning or policy.library().turning,
+        stop_angle=stop_angle or policy.library().stop_angle,
         angles=np.array([t.angle for t in turns] + [0.0]),
         gaps=np.append(np.diff(marks), [1e3, 1e3]),
         front_x=sonar.mounts[front].x,

@@ -1,0 +1,83 @@
+"""One turn in the open, stopped at a yaw rate: nothing but that is asked on the way."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from countersteer.car.car import Car
+from countersteer.car.parameter import Scalar, pytree
+from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.straighten import holding_throttle
+from countersteer.drivers.turning import Turning
+
+RUN_UP = 0.3  # s straight ahead before the wheels turn over
+
+AHEAD, SPIN, STOP = 0, 1, 2
+
+
+class Memory(NamedTuple):
+    """What the driver is about."""
+
+    phase: Scalar
+    spun: Scalar  # when the wheels turned over, s
+    turn: Scalar  # 1 once they have
+
+
+@pytree
+class OpenTurn:
+    """Runs up, spins as `Turning.spin` says, and stops as `Turning.stop` does with nothing missing.
+
+    The throttle is killed at the yaw rate `kill`, or after `longest` seconds where that does not
+    come.
+    """
+
+    turning: Turning
+    speed: Scalar  # of entry, m/s: what the run-up holds
+    hand: Scalar  # 1 left, -1 right
+    kill: Scalar  # rad/s, in the turn's hand
+    longest: Scalar  # s
+    hold: Scalar  # throttle that holds the speed
+    limit: Scalar  # of steering, rad
+    run_up: Scalar = RUN_UP  # s
+
+    def reset(self, key: jax.Array) -> Memory:
+        """Straight ahead."""
+        del key
+        return Memory(AHEAD, 0.0, 0)
+
+    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+        """One control period."""
+        estimate, now = observation.estimate, observation.time
+        rate = self.hand * estimate.yaw_rate
+        begins = (memory.phase == AHEAD) & (now >= self.run_up - 1e-6)
+        spun = jnp.where(begins, now, memory.spun)
+        killed = (rate >= self.kill) | (now - spun >= self.longest - 1e-6)
+        phase = jnp.where(begins, SPIN, memory.phase)
+        phase = jnp.where((memory.phase == SPIN) & killed, STOP, phase)
+        spin = self.turning.spin(self.speed, rate)
+        stop = self.turning.stop(self.speed, 0.0)
+        steering = jnp.where(phase == SPIN, spin.steering, stop.steering)
+        throttle = jnp.where(phase == SPIN, spin.throttle, stop.throttle)
+        ahead = phase == AHEAD
+        held = jnp.clip(self.hold + 0.25 * (self.speed - estimate.vx), 0.0, 1.0)
+        command = Command(
+            jnp.clip(jnp.where(ahead, held, throttle), -1.0, 1.0),
+            jnp.where(ahead, 0.0, jnp.clip(self.hand * steering, -self.limit, self.limit)),
+        )
+        return command, Memory(phase, spun, jnp.where(phase == AHEAD, 0, 1))
+
+
+def open_turn(
+    car: Car, turning: Turning, speed: float, hand: int, kill: float, longest: float
+) -> OpenTurn:
+    """For a nominal car: by a left (1) or right (-1) hand, killed at a yaw rate (rad/s)."""
+    return OpenTurn(
+        turning=turning,
+        speed=speed,
+        hand=float(hand),
+        kill=kill,
+        longest=longest,
+        hold=holding_throttle(car, speed) + float(car.motor.dead_zone),
+        limit=min(float(car.servo.limit_left), float(car.servo.limit_right)),
+    )

@@ -1,0 +1,179 @@
+"""Policies in TOML files: the numbers of a driver, as plain data.
+
+    kind = "drift-turn"
+    [stop_angle]
+    speed_mps = [1.0, 1.6]
+    offset_deg = [0.0, 0.0]
+    slope_s = [0.12, 0.12]
+    deviation_deg = [5.7, 5.7]
+    [turning]
+    ...
+    [source]
+    stop_angle = "where these numbers are from"
+
+Tables hold a number for each speed. A table that is not there is that of the library's
+`drift-turn.toml`, which has them all.
+"""
+
+import functools
+import importlib.resources
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomli_w
+
+from countersteer.car.files import read_toml
+from countersteer.car.parameter import EDGE, Declaration, read_value, unknown_key, write_value
+from countersteer.drivers.stop_angle import StopAngle
+from countersteer.drivers.turning import Turning
+from countersteer.errors import InputError
+
+LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
+KIND = "drift-turn"
+MOST_SPEEDS = 32
+
+
+class Entry(NamedTuple):
+    """How a field stands in a file: its key, whether one for each speed, unit and range there."""
+
+    key: str
+    by_speed: bool
+    unit: str
+    low: float
+    high: float
+
+    @property
+    def declared(self) -> Declaration:
+        """With the range in the unit used inside."""
+        factor = EDGE[self.unit][1]
+        return Declaration(self.unit, self.low * factor, self.high * factor, self.key, "policy")
+
+    @property
+    def name(self) -> str:
+        """The key with its unit."""
+        return self.key + EDGE[self.unit][0]
+
+
+# By the names of the fields inside.
+TABLES: dict[str, tuple[type, dict[str, Entry]]] = {
+    "stop_angle": (
+        StopAngle,
+        {
+            "speeds": Entry("speed", True, "m/s", 0, 20),
+            "offset": Entry("offset", True, "rad", -180, 180),
+            "slope": Entry("slope", True, "s", -2, 2),
+            "deviation": Entry("deviation", True, "rad", 0, 180),
+        },
+    ),
+    "turning": (
+        Turning,
+        {
+            "speeds": Entry("speed", True, "m/s", 0, 20),
+            "lead": Entry("lead", True, "m", -2, 10),
+            "lock": Entry("lock", True, "rad", -90, 90),
+            "rate": Entry("rate", True, "rad/s", 0, 1500),
+            "throttle": Entry("throttle", True, "1", -1, 1),
+            "counter": Entry("counter", True, "rad", -90, 90),
+            "rate_gain": Entry("rate_gain", False, "s", -10, 10),
+            "stop_gain": Entry("stop_gain", False, "1", -100, 100),
+            "settled": Entry("settled", False, "rad/s", 0, 1500),
+            "hold_p": Entry("hold_p", False, "1", -100, 100),
+            "hold_d": Entry("hold_d", False, "s", -10, 10),
+            "hold_slip": Entry("hold_slip", False, "1", -10, 10),
+            "hold_throttle": Entry("hold_throttle", False, "1", -1, 1),
+        },
+    ),
+}
+
+
+class Policy(NamedTuple):
+    """The numbers of the drift-turn driver."""
+
+    turning: Turning
+    stop_angle: StopAngle
+
+
+def load_policy(name: str) -> Policy:
+    """A policy from the library or a file. Raises `InputError` naming file, key and range."""
+    tables, where = read_toml(name, LIBRARY, "policy")
+    known = {"kind": 0, "description": 0, "source": 0, **TABLES}
+    for key in tables:
+        if key not in known:
+            raise unknown_key(where, key, known)
+    if tables.get("kind") != KIND:
+        raise InputError(f'{where}: kind must be "{KIND}", not {tables.get("kind")!r}')
+    if not set(TABLES) & set(tables):
+        raise InputError(f"{where}: holds no number: give {' or '.join(f'[{t}]' for t in TABLES)}")
+    read = {part: _read(where, part, tables[part]) for part in TABLES if part in tables}
+    return library()._replace(**read) if len(read) < len(TABLES) else Policy(**read)
+
+
+@functools.cache
+def library() -> Policy:
+    """The one that the driver has of its own."""
+    return load_policy(KIND)
+
+
+def _read(where: str, part: str, table: Any) -> Any:
+    """A table as the class that it stands for."""
+    made, entries = TABLES[part]
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: {part} must be a table of numbers")
+    names = {entry.name: 0 for entry in entries.values()}
+    for key in table:
+        if key not in names:
+            raise unknown_key(where, f"{part}.{key}", {f"{part}.{k}": 0 for k in names})
+    values: dict[str, Any] = {}
+    for field, entry in entries.items():
+        key = f"{part}.{entry.name}"
+        if entry.name not in table:
+            raise InputError(f"{where}: {key} is missing")
+        value = table[entry.name]
+        if not entry.by_speed:
+            values[field] = read_value(where, key, entry.declared, value)
+            continue
+        if not isinstance(value, list) or not 1 <= len(value) <= MOST_SPEEDS:
+            raise InputError(f"{where}: {key} must be a list of 1 to {MOST_SPEEDS} numbers")
+        values[field] = np.array(
+            [read_value(where, f"{key}[{i}]", entry.declared, v) for i, v in enumerate(value)]
+        )
+        if len(value) != len(values["speeds"]):
+            count = len(values["speeds"])
+            raise InputError(f"{where}: {key} must hold {count} numbers, as {part}.speed_mps does")
+    if np.any(np.diff(values["speeds"]) <= 0):
+        raise InputError(f"{where}: {part}.speed_mps must rise")
+    return made(**values)
+
+
+def policy_tables(
+    turning: Turning | None = None, stop_angle: StopAngle | None = None
+) -> dict[str, Any]:
+    """What of the two there is, as the tables of a file."""
+    tables = {}
+    for part, value in (("stop_angle", stop_angle), ("turning", turning)):
+        if value is not None:
+            tables[part] = {
+                entry.name: _written(entry.declared, getattr(value, field))
+                for field, entry in TABLES[part][1].items()
+            }
+    return tables
+
+
+def _written(declared: Declaration, value: Any) -> Any:
+    """A number, or a list of them, without the last digits that degrees have from radians."""
+    if np.ndim(value):
+        return [_written(declared, one) for one in np.asarray(value)]
+    return float(f"{write_value(declared, value):.9g}")
+
+
+def save_policy(
+    path: Path,
+    source: Mapping[str, str],
+    turning: Turning | None = None,
+    stop_angle: StopAngle | None = None,
+) -> None:
+    """Write a policy. `source` says where its numbers are from."""
+    tables = {"kind": KIND, **policy_tables(turning, stop_angle), "source": dict(source)}
+    path.write_text(tomli_w.dumps(tables))

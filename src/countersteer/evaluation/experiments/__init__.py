@@ -1,0 +1,22 @@
+"""The paper's measurements, one a file: a table, a picture and a paragraph of figures each.
+
+A module has `simulate(car, name, report)`, and `measure(runs)` where run folders can tell it too.
+"""
+
+import importlib
+from typing import Any
+
+NAMES = {
+    "turn-rate": "yaw rate over the wheels' angle without slip",
+    "drift-threshold": "wheels over without throttle: at which energy it drifts",
+    "stop-time": "time and angle until a turn is stopped, over its yaw rate",
+    "drift-turn": "one turn in all its signals",
+    "control-rate": "10 Hz by radio or 1000 Hz on board, open or closed loop, two batteries",
+    "battery": "the same commands at four charges and three wears",
+    "narrowest-corner": "the narrowest corner passed, and how fast, by grip and by drift",
+}
+
+
+def load(name: str) -> Any:
+    """The module of an experiment."""
+    return importlib.import_module(f"{__name__}.{name.replace('-', '_')}")

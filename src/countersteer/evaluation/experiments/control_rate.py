@@ -1,0 +1,196 @@
+"""10 Hz over a lossy radio against 1000 Hz on board, open loop against closed, two batteries.
+
+The paper's own argument. One corner of 90°, cars drawn around the nominal one, a full new pack or
+one that is worn and nearly flat. Open loop means that the commands of a turn are those which the
+closed loop gave in it with the nominal car and the first battery, played back from the place at
+which the driver hands over; before and after, the closed loop drives.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.car.parameter import Scalar, changed, pytree
+from countersteer.course.course import Course, from_segments
+from countersteer.drivers.drift_turn import STRAIGHT, DriftTurn, drift_turn
+from countersteer.drivers.driver import Command, Observation
+from countersteer.evaluation.evaluate import interval
+from countersteer.evaluation.experiments.found import Found, Report, silent
+from countersteer.evaluation.population import draw, load_population
+from countersteer.evaluation.rollout import LANES, REACHED, rollouts
+from countersteer.link.link import LINKS
+from countersteer.simulator import Simulator
+
+TRIALS = 256
+SPEED = 2.0  # m/s
+STEP = 0.01  # s between the recorded commands
+AFTER = 0.2  # s for which they go on once the car goes straight
+LONGEST = 8.0  # s of a trial
+BATTERIES = {"first": (1.0, 0.0), "last": (0.3, 1.0)}  # charge, wear
+
+
+class Memory(NamedTuple):
+    """Of the driver within, and when the turn began (s)."""
+
+    inner: Any
+    turn: Scalar
+    begun: Scalar
+
+
+@pytree
+class OpenLoop:
+    """A turn's commands played back from where the driver within hands over to it."""
+
+    inner: DriftTurn
+    throttle: np.ndarray  # each `STEP` seconds from the turn's beginning
+    steering: np.ndarray  # rad
+
+    def reset(self, key: jax.Array) -> Memory:
+        """Before the turn."""
+        return Memory(self.inner.reset(key), 0, math.inf)
+
+    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+        """The recorded command in the turn, else the inner driver's."""
+        now = observation.time
+        command, inner = self.inner.act(memory.inner, observation)
+        begun = jnp.where(inner.turn > memory.turn, now, memory.begun)
+        index = jnp.floor((now - begun) / STEP + 1e-3)
+        count = self.throttle.shape[-1]
+        playing = (index >= 0) & (index < count)
+        at = jnp.clip(jnp.where(playing, index, 0), 0, count - 1).astype(jnp.int32)
+        throttle, steering = jnp.asarray(self.throttle)[at], jnp.asarray(self.steering)[at]
+        # What the driver within made of the turn is not asked: behind it, it straightens.
+        over = (index >= count) & (now - begun < (count + 2) * STEP)
+        inner = inner._replace(phase=jnp.where(over, STRAIGHT, inner.phase))
+        command = Command(
+            jnp.where(playing, throttle, command.throttle),
+            jnp.where(playing, steering, command.steering),
+        )
+        return command, Memory(inner, inner.turn, begun)
+
+
+def corner(width: float = 1.4, name: str = "corner") -> Course:
+    """A right turn of 90° between two straights."""
+    segments = [("straight", 3.5, 0.0), ("turn", -math.pi / 2, 0.0), ("straight", 3.5, 0.0)]
+    return from_segments(name, width, False, segments, (0.5, 0.0, 0.0), 6.2)
+
+
+def record(course: Course, car: Car, driver: DriftTurn) -> tuple[np.ndarray, np.ndarray]:
+    """Throttle and steering of the turn with the nominal car and the first battery."""
+    simulator = Simulator(course, jax.tree.map(np.float32, car), driver, seed=0)
+    drive = simulator.record(LONGEST)
+    turning = np.nonzero(drive.turn > 0)[0]
+    calm = (np.abs(drive.motion.yaw_rate) < math.radians(30)) & (
+        np.abs(np.arctan2(drive.motion.vy, drive.motion.vx)) < math.radians(10)
+    )
+    begin = int(turning[0])
+    stirred = begin + int(np.argmax(~calm[begin:]))
+    held = np.convolve(calm[stirred:].astype(int), np.ones(50, int), "valid")
+    end = stirred + int(np.argmax(held == 50)) + 50 + round(AFTER / simulator.dt)
+    every = slice(begin, end, round(STEP / simulator.dt))
+    return drive.command.throttle[every], drive.command.steering[every]
+
+
+def simulate(
+    car: Car, name: str, report: Report = silent, trials: int = TRIALS, lanes: int = LANES
+) -> Found:
+    """Eight cells of trials: rate, loop, battery."""
+    course = corner()
+    closed = drift_turn(course, car, SPEED)
+    open_loop = OpenLoop(
+        inner=closed,
+        **dict(zip(("throttle", "steering"), record(course, car, closed), strict=True)),
+    )
+    population, seeds = load_population("around"), range(trials)
+    rows: dict[str, list[Any]] = {}
+    errors: dict[tuple[str, str, str], np.ndarray] = {}
+    cells = [
+        (link, loop, battery)
+        for link in LINKS
+        for loop in ("open", "closed")
+        for battery in BATTERIES
+    ]
+    for number, (link, loop, battery) in enumerate(cells):
+        charge, wear = BATTERIES[battery]
+        drawn = draw(
+            dataclasses.replace(population, charge=(charge, charge)), car, course, seeds, np.float32
+        )
+        cars = changed(drawn.cars, "battery.wear", np.full(trials, wear, np.float32))
+        driver: Any = closed if loop == "closed" else open_loop
+        simulator = Simulator(course, jax.tree.map(np.float32, car), driver, LINKS[link])
+        score = rollouts(
+            simulator, drawn._replace(cars=cars), [driver] * trials, seeds, 1, LONGEST, lanes=lanes
+        )
+        won = score.status == REACHED
+        ended = np.isfinite(score.turns.end[:, 0])
+        error = np.degrees(score.turns.error[ended, 0])
+        errors[link, loop, battery] = error
+        low, high = interval(int(won.sum()), trials)
+        for key, value in {
+            "control_hz": 1 / LINKS[link].control_period,
+            "link": link,
+            "loop": loop,
+            "battery": battery,
+            "battery_charge": charge,
+            "battery_wear": wear,
+            "trials": trials,
+            "success_rate": float(won.mean()),
+            "success_low": low,
+            "success_high": high,
+            "turns_ended": int(ended.sum()),
+            "heading_error_mean_deg": float(error.mean()) if len(error) else math.nan,
+            "heading_error_rms_deg": float(np.sqrt(np.mean(error**2))) if len(error) else math.nan,
+            "peak_sideslip_median_deg": float(
+                np.degrees(np.median(score.turns.peak_sideslip[ended, 0]))
+            )
+            if len(error)
+            else math.nan,
+        }.items():
+            rows.setdefault(key, []).append(value)
+        report(number + 1, len(cells))
+    figures = {
+        "car": name,
+        "speed_mps": SPEED,
+        "cells": [dict(zip(rows, cell, strict=True)) for cell in zip(*rows.values(), strict=True)],
+    }
+
+    def cell(link: str, loop: str, battery: str) -> str:
+        i = cells.index((link, loop, battery))
+        rate, error = rows["success_rate"][i], rows["heading_error_rms_deg"][i]
+        return f"{100 * rate:.0f} % pass ({error:.0f}° rms of heading)"
+
+    def pair(link: str, loop: str) -> str:
+        return f"{cell(link, loop, 'first')} with the first, {cell(link, loop, 'last')} the last"
+
+    text = (
+        f"A 90° corner, 1.4 m wide, at {SPEED:g} m/s, {trials} cars drawn around {name}, with the "
+        f"first battery (full, new) and the last (30 %, worn). On board at 1000 Hz, closed loop: "
+        f"{pair('onboard', 'closed')}; open loop: {pair('onboard', 'open')}. Over the radio at "
+        f"10 Hz, closed loop: {pair('radio', 'closed')}; open loop: {pair('radio', 'open')}."
+    )
+
+    def paint(figure: Any) -> None:
+        left, right = figure.subplots(1, 2)
+        rates = {"onboard": "1000 Hz on board", "radio": "10 Hz by radio"}
+        labels = [f"{rates[link]}\n{loop} loop, {battery} battery" for link, loop, battery in cells]
+        colours = ["tab:blue" if loop == "closed" else "tab:orange" for _, loop, _ in cells]
+        place = np.arange(len(cells))[::-1]
+        rate = np.array(rows["success_rate"])
+        ends = np.abs(np.array([rows["success_low"], rows["success_high"]]) - rate)
+        left.barh(place, 100 * rate, xerr=100 * ends, color=colours, height=0.7)
+        left.set_yticks(place, labels, fontsize=8)
+        left.set_xlabel("corners passed, % (95 % interval)")
+        left.set_xlim(0, 100)
+        shown = [errors[one] if len(errors[one]) else np.array([math.nan]) for one in cells]
+        right.boxplot(shown, positions=place, orientation="horizontal", widths=0.6, sym=".")
+        right.set_yticks(place, [""] * len(cells))
+        right.axvline(0, color="grey", linewidth=0.8)
+        right.set_xlabel("heading error of turns that ended, °")
+        figure.suptitle(f"control-rate: {name}, {trials} trials each")
+
+    return Found(rows, figures, text, paint, (11.0, 4.6))

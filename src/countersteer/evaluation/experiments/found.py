@@ -1,0 +1,54 @@
+"""What an experiment finds, and its files."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Report = Callable[[int, int], None]
+
+
+def silent(done: int, of: int) -> None:
+    """Reports to nobody."""
+
+
+class Found(NamedTuple):
+    """A table (columns by name, with units), figures for JSON, a paragraph, a picture."""
+
+    table: Mapping[str, Sequence[Any] | np.ndarray]
+    figures: dict[str, Any]
+    text: str
+    draw: Callable[[Any], None]  # on a matplotlib figure
+    size: tuple[float, float] = (10.0, 4.0)  # inches
+
+
+def write(found: Found, folder: Path, name: str) -> dict[str, Any]:
+    """Write NAME.csv, NAME.png and summary.json; returns what the last holds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    lines = [",".join(found.table)]
+    lines += [
+        ",".join(_cell(value) for value in row) for row in zip(*found.table.values(), strict=True)
+    ]
+    (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    figure = plt.figure(figsize=found.size, layout="constrained")
+    found.draw(figure)
+    figure.savefig(folder / f"{name}.png", dpi=110)
+    plt.close(figure)
+    result = {"experiment": name, **found.figures, "text": found.text}
+    (folder / "summary.json").write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    return result
+
+
+def _cell(value: Any) -> str:
+    """A number to six digits, none for NaN, or a word."""
+    if isinstance(value, str):
+        return value
+    number = float(value)
+    return "" if math.isnan(number) else f"{number:.6g}"

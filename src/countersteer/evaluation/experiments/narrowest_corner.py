@@ -1,0 +1,327 @@
+"""The narrowest 90° corner that a car passes, and the time through it: by grip, and by drift.
+
+A law's numbers are drawn some hundred times for each width (the same draws at every width), and a
+width is passed when any draw gets through without a touch: what is compared is what the two ways
+can do when they are told everything, not how well a driver senses. Both begin 1.2 m before the
+corner at their speed, and are through when the car is 1.2 m behind it, within 30° of the corridor.
+
+By grip: wheels over by one angle, back again so that the car comes out straight, at one speed; the
+rear axle never slips by more than 12°. By drift: the laws of drift-turn over a gap, with sideslip
+of over 25°.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import qmc
+
+from countersteer.car.car import Car
+from countersteer.car.parameter import Scalar, pytree
+from countersteer.course.course import from_segments
+from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.policy import library
+from countersteer.drivers.stop_angle import StopAngle
+from countersteer.drivers.straighten import holding_throttle
+from countersteer.drivers.turning import Turning
+from countersteer.evaluation.evaluate import DRIFT
+from countersteer.evaluation.experiments.found import Found, Report, silent
+from countersteer.evaluation.open_drives import batch, drives
+from countersteer.evaluation.rollout import LANES
+
+DRAWS = 512
+GATE = 1.2  # m before and behind the corner
+WIDEST, RESOLUTION = 2.0, 0.01  # m
+LINED_UP = math.radians(30)
+GRIP_SLIP = math.radians(12)
+LONGEST = 4.5  # s
+MARGIN = 0.03  # m from the outer wall at the start
+# Ends of what is drawn: speed (m/s), part of the free room towards the outer wall, distance of the
+# turning-in from the corner (m), and how far the wheels go or the law's numbers are scaled.
+GRIP = ((0.6, 2.6), (0.0, 1.0), (-0.4, 1.0), (0.3, 1.0), (0.0, 1.0))
+SLIDE = ((1.2, 3.0), (0.0, 1.0), (-0.4, 1.15), (0.7, 1.6), (0.0, 1.0))
+
+AHEAD, TURN, STOP, SETTLE = 0, 1, 2, 3
+
+
+class Memory(NamedTuple):
+    """What the driver is about."""
+
+    phase: Scalar
+    entry: Scalar  # m/s
+
+
+@pytree
+class Corner:
+    """A left turn of 90° begun at x; told the truth. `slides`: by the laws of drift-turn."""
+
+    turning: Turning
+    stop_angle: StopAngle
+    slides: Scalar  # 1 by drift, 0 by grip
+    speed: Scalar
+    begin: Scalar  # x at which the wheels turn over, m
+    lock: Scalar  # by grip, rad
+    hold: Scalar  # throttle that holds the speed
+    power: Scalar  # by drift: factor on the throttle of the spin
+    limit: Scalar
+    front_axle: Scalar
+
+    def reset(self, key: jax.Array) -> Memory:
+        """Straight ahead."""
+        del key
+        return Memory(AHEAD, 0.0)
+
+    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+        """One control period."""
+        seen, own = observation.estimate, self.turning
+        speed = jnp.maximum(seen.vx, 0.5)
+        left_over = math.pi / 2 - seen.heading
+        begins = (memory.phase == AHEAD) & (seen.x >= self.begin)
+        entry = jnp.where(begins, speed, memory.entry)
+        missing = left_over - self.stop_angle.angle(speed, jnp.maximum(seen.yaw_rate, 0.0))
+        stops = (memory.phase == TURN) & (missing <= 0)
+        settles = (memory.phase == STOP) & (seen.yaw_rate < own.settled)
+        phase = memory.phase
+        for happens, into in ((begins, TURN), (stops, STOP), (settles, SETTLE)):
+            phase = jnp.where(happens, into, phase)
+        held = jnp.clip(self.hold + 0.25 * (self.speed - seen.vx), 0.0, 1.0)
+        spin, stop = own.spin(entry, seen.yaw_rate), own.stop(entry, missing)
+        slip = jnp.arctan2(seen.vy + self.front_axle * seen.yaw_rate, speed)
+        settle = own.hold_p * left_over - own.hold_d * seen.yaw_rate + own.hold_slip * slip
+        straight = -0.9 * seen.heading - 0.1 * seen.yaw_rate
+        steering, throttle = straight, held
+        for which, lock, power in (
+            (TURN, spin.steering, self.power * spin.throttle),
+            (STOP, stop.steering, stop.throttle),
+            (SETTLE, settle, held),
+        ):
+            steering = jnp.where(phase == which, lock, steering)
+            throttle = jnp.where(phase == which, power, throttle)
+        # By grip the lock is given back in time for the car to come out straight.
+        arc = jnp.clip(2.0 * left_over - 0.25 * seen.yaw_rate, -self.lock, self.lock)
+        slides, ahead = self.slides > 0, phase == AHEAD
+        steering = jnp.where(slides | ahead, steering, arc)
+        throttle = jnp.where(slides, throttle, held)
+        return Command(
+            jnp.clip(throttle, 0.0, 1.0), jnp.clip(steering, -self.limit, self.limit)
+        ), Memory(phase, entry)
+
+
+class Tried(NamedTuple):
+    """What came of the draws at a width; times are NaN for those that did not pass."""
+
+    time: np.ndarray
+    entry_speed: np.ndarray
+    peak_sideslip: np.ndarray
+    track: np.ndarray  # (3, samples) x, y, heading of the fastest; empty where none passed
+
+
+def attempt(car: Car, width: float, slides: bool, draws: int, lanes: int) -> Tried:
+    """All draws of one law at one width."""
+    segments = [("straight", 3.0, 0.0), ("turn", math.pi / 2, 0.0), ("straight", 3.0, 0.0)]
+    course = from_segments("corner", width, False, segments)
+    ends = np.array(SLIDE if slides else GRIP)
+    u = qmc.Sobol(len(ends), rng=0).random(draws)
+    speed, room, before, lock, fifth = (ends[:, 0] + (ends[:, 1] - ends[:, 0]) * u).T
+    limit = min(float(car.servo.limit_left), float(car.servo.limit_right))
+    free = max(width / 2 - float(car.body.width) / 2 - MARGIN, 0.0)
+    policy = library()
+    drivers = [
+        Corner(
+            turning=_scaled(policy.turning, lock[i] if slides else 1.0),
+            stop_angle=policy.stop_angle,
+            slides=float(slides),
+            speed=speed[i],
+            begin=3.0 - before[i],
+            lock=limit * lock[i],
+            hold=holding_throttle(car, speed[i]) + float(car.motor.dead_zone),
+            power=0.6 + 0.8 * fifth[i],
+            limit=limit,
+            front_axle=float(car.body.front_axle),
+        )
+        for i in range(draws)
+    ]
+    still = np.zeros(draws)
+    pose = np.stack([3.0 - GATE + still, -room * free, still], axis=1)
+    sampled = drives(
+        batch(car, draws),
+        np.ones(draws, np.float32),
+        drivers,
+        np.stack([speed, still, still], axis=1),
+        LONGEST,
+        pose=pose,
+        walls=course.walls,
+        lanes=lanes,
+    )
+    m = sampled.motion
+    through = (m.y >= GATE) & (np.abs(m.x - 3.0) < width / 2)
+    at = np.argmax(through, axis=1)
+    rows = np.arange(draws)
+    before_gate = np.arange(m.x.shape[1])[None] <= at[:, None]
+    slip = np.where(np.hypot(m.vx, m.vy) > 0.2, np.abs(np.arctan2(m.vy, m.vx)), 0.0)
+    peak = np.max(np.where(before_gate, slip, 0.0), axis=1)
+    rear = float(car.body.wheelbase - car.body.front_axle)
+    axle = np.abs(np.arctan2(m.vy - rear * m.yaw_rate, np.maximum(m.vx, 0.2)))
+    slid = np.max(np.where(before_gate, axle, 0.0), axis=1)
+    passed = (
+        np.any(through, axis=1)
+        & (sampled.wall_contacts[rows, at] == 0)
+        & (np.abs(m.heading[rows, at] - math.pi / 2) < LINED_UP)
+        & ((peak > DRIFT) if slides else (slid < GRIP_SLIP))
+    )
+    # Between two samples the car moves by some millimetres: the gate is crossed in between.
+    earlier = np.maximum(at - 1, 0)
+    part = (GATE - m.y[rows, earlier]) / np.maximum(m.y[rows, at] - m.y[rows, earlier], 1e-9)
+    time = sampled.time[earlier] + np.clip(part, 0, 1) * (sampled.time[at] - sampled.time[earlier])
+    time = np.where(passed, time, math.nan)
+    track = np.zeros((3, 0))
+    if np.any(passed):
+        best = int(np.nanargmin(time))
+        track = np.stack([m.x[best], m.y[best], m.heading[best]])[:, : at[best] + 1]
+    return Tried(time, speed, peak, track)
+
+
+def _scaled(turning: Turning, factor: float) -> Turning:
+    """The laws with the yaw rate that is held scaled, for corners tighter or wider."""
+    return dataclasses.replace(turning, rate=factor * turning.rate)
+
+
+def simulate(
+    car: Car, name: str, report: Report = silent, draws: int = DRAWS, lanes: int = LANES
+) -> Found:
+    """Bisection for the narrowest width of either law, and times over a range of widths."""
+    low, high = float(car.body.width), WIDEST
+    halvings = math.ceil(math.log2((high - low) / RESOLUTION))
+    widths = (0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.4)
+    steps, done = 2 * (halvings + len(widths) + 1), 0
+    tried: dict[tuple[bool, float], Tried] = {}
+
+    def passes(slides: bool, width: float) -> bool:
+        nonlocal done
+        tried[slides, width] = attempt(car, width, slides, draws, lanes)
+        done += 1
+        report(done, steps)
+        return bool(np.any(np.isfinite(tried[slides, width].time)))
+
+    narrowest: dict[bool, float] = {}
+    for slides in (False, True):
+        narrowest[slides] = math.nan
+        for width in widths:
+            passes(slides, width)
+        if passes(slides, high):
+            bottom, top = low, high
+            while top - bottom > RESOLUTION:
+                middle = (top + bottom) / 2
+                if passes(slides, middle):
+                    top = middle
+                else:
+                    bottom = middle
+            narrowest[slides] = top
+    order = sorted(tried)
+    best = {key: _best(tried[key]) for key in order}
+    # What gets through a narrow corridor gets through a wider one with the same middle.
+    fastest = {
+        (s, w): np.nanmin([best[key][0] for key in order if key[0] == s and key[1] <= w] + [np.inf])
+        for s, w in order
+    }
+    table: dict[str, list[Any]] = {
+        "way": ["drift" if slides else "grip" for slides, _ in order],
+        "width_m": [width for _, width in order],
+        "draws": [draws] * len(order),
+        "passed": [int(np.isfinite(tried[key].time).sum()) for key in order],
+        "best_time_s": [best[key][0] for key in order],
+        "best_time_up_to_width_s": [
+            fastest[key] if np.isfinite(fastest[key]) else math.nan for key in order
+        ],
+        "entry_speed_mps": [best[key][1] for key in order],
+        "peak_sideslip_deg": [best[key][2] for key in order],
+    }
+    found = {}
+    for slides, way in ((False, "grip"), (True, "drift")):
+        width = narrowest[slides]
+        known = not math.isnan(width)
+        there = best[slides, width] if known else (math.nan,) * 3
+        found[way] = {
+            "narrowest_m": width if known else None,
+            "time_s": there[0] if known else None,
+            "entry_speed_mps": there[1] if known else None,
+            "peak_sideslip_deg": there[2] if known else None,
+        }
+    figures = {
+        "car": name,
+        "draws": draws,
+        "resolution_m": RESOLUTION,
+        "gates_m": 2 * GATE,
+        **found,
+    }
+
+    def say(way: str) -> str:
+        one = found[way]
+        if one["narrowest_m"] is None:
+            return f"by {way} none of up to {WIDEST:g} m"
+        return (
+            f"by {way} {one['narrowest_m']:.2f} m, in {one['time_s']:.2f} s at an entry of "
+            f"{one['entry_speed_mps']:.2f} m/s"
+        )
+
+    said = []
+    for width in widths:
+        times = [fastest[slides, width] for slides in (False, True)]
+        words = [f"{t:.2f} s" if math.isfinite(t) else "not passed" for t in times]
+        said.append(f"{width:g} m {words[0]} and {words[1]}")
+    text = (
+        f"The narrowest 90° corner that {name} passes, of {draws} draws of each law: "
+        f"{say('grip')}; {say('drift')}. Fastest from 1.2 m before the corner to 1.2 m behind "
+        f"it, by grip and by drift, over width: {'; '.join(said)}."
+    )
+
+    def paint(figure: Any) -> None:
+        left, *maps = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
+        for slides, way, colour in ((False, "grip", "tab:blue"), (True, "drift", "tab:red")):
+            mine = [
+                (w, fastest[s, w]) for s, w in order if s == slides and np.isfinite(fastest[s, w])
+            ] or [(math.nan, math.nan)]
+            left.plot(*zip(*mine, strict=True), ".-", color=colour, label=way)
+            if not math.isnan(narrowest[slides]):
+                left.axvline(narrowest[slides], color=colour, linewidth=0.8, linestyle=":")
+        left.set_xlabel("width of the corridor, m")
+        left.set_ylabel("best time between the gates, s")
+        left.set_ylim(bottom=0)
+        left.legend(frameon=False)
+        for ax, slides, way in zip(maps, (False, True), ("grip", "drift"), strict=True):
+            width = narrowest[slides]
+            ax.set_aspect("equal")
+            ax.set_title(f"by {way}: " + ("none" if math.isnan(width) else f"{width:.2f} m"))
+            if math.isnan(width):
+                continue
+            _draw_track(ax, car, width, tried[slides, width].track)
+        figure.suptitle(f"narrowest-corner: {name}")
+
+    return Found(table, figures, text, paint, (12.0, 4.2))
+
+
+def _best(tried: Tried) -> tuple[float, float, float]:
+    """Time, entry speed and peak sideslip (°) of the fastest draw."""
+    if not np.any(np.isfinite(tried.time)):
+        return math.nan, math.nan, math.nan
+    i = int(np.nanargmin(tried.time))
+    slip = math.degrees(float(tried.peak_sideslip[i]))
+    return float(tried.time[i]), float(tried.entry_speed[i]), slip
+
+
+def _draw_track(ax: Any, car: Car, width: float, track: np.ndarray) -> None:
+    """The corner with the car's outline every tenth of a second."""
+    half = width / 2
+    for sign in (1, -1):
+        ax.plot([1.5, 3.0 - sign * half, 3.0 - sign * half], [sign * half] * 2 + [1.6], "k", lw=1)
+    ahead, aside = float(car.body.length) / 2, float(car.body.width) / 2
+    outline = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) * (ahead, aside)
+    ax.plot(track[0], track[1], color="grey", lw=0.8)
+    for x, y, heading in track[:, ::20].T:
+        c, s = math.cos(heading), math.sin(heading)
+        ax.plot(*(outline @ np.array([[c, s], [-s, c]]) + (x, y)).T, color="tab:blue", lw=0.7)
+    ax.set_xlim(1.6, 3.0 + half + 0.1)
+    ax.set_ylim(-half - 0.1, 1.6)

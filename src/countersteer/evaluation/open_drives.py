@@ -1,0 +1,173 @@
+"""Many short drives at once, sampled as they go: what trials and experiments look at.
+
+Each lane has its own car, charge, velocity at the start and driver's numbers. There is no sensor
+and no link, and nothing is judged: the driver is called at each tick, and told the time and the
+true motion. Without walls it is open floor.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from countersteer.car.car import Car
+from countersteer.car.parameter import Array
+from countersteer.drivers.driver import Command, Driver, Heard, Observation
+from countersteer.drivers.replay import Replay
+from countersteer.estimation.estimate import Estimate
+from countersteer.evaluation.rollout import LANES, LOOK
+from countersteer.simulator import padded
+from countersteer.world import planar
+from countersteer.world.floor import Floor
+from countersteer.world.state import Motion, State
+
+PIECE = 100  # samples of a call, whatever the length of the drives
+DT = 0.001  # s
+STEPS = 4
+NOTHING = Heard(math.nan, math.inf)
+
+
+class Lanes(NamedTuple):
+    """What the drives run with; leaves have an axis of drives in front."""
+
+    car: Car
+    driver: Any
+    charge: Array
+    velocity: Array
+    pose: Array
+    floor: Floor | None
+
+
+class Sampled(NamedTuple):
+    """What came of the drives: arrays of (drives, samples)."""
+
+    time: np.ndarray  # (samples,), s
+    motion: Motion
+    command: Command
+    wall_contacts: np.ndarray
+
+
+def drives(
+    cars: Car,
+    charge: Array,
+    drivers: Sequence[Driver],
+    velocity: Array,
+    longest: float,
+    pose: Array | None = None,
+    walls: Array | None = None,
+    floor: Floor | None = None,
+    report: Callable[[int, int], None] = lambda *_: None,
+    lanes: int = LANES,
+) -> Sampled:
+    """One drive of `longest` seconds for each driver, sampled each `LOOK` seconds.
+
+    `velocity` (drives, 3) is vx, vy and yaw rate at the start, at which the wheels roll, and `pose`
+    (drives, 3) x, y and heading; `walls` are (n, 4), for all. Leaves of `cars` and `floor` have an
+    axis of drives in front; the precision is that of `charge`.
+    """
+    dtype = np.asarray(charge).dtype
+    driver = jax.tree.map(lambda *leaves: np.stack(leaves).astype(dtype), *drivers)
+    pose = np.zeros((len(drivers), 3)) if pose is None else pose
+    own = Lanes(cars, driver, charge, np.asarray(velocity, dtype), np.asarray(pose, dtype), floor)
+    around = padded(np.zeros((0, 4)) if walls is None else walls, dtype)
+    mesh = Mesh(np.array(jax.devices()), ("core",))
+    count, width = len(drivers), lanes * mesh.size
+    pieces, kept = math.ceil(longest / (PIECE * LOOK)), round(longest / LOOK)
+    slots = planar.delay_slots(cars, DT)
+    blocks = []
+    for first in range(0, count, width):
+        picked, rows = np.arange(first, first + width) % count, min(width, count - first)
+        block = jax.tree.map(lambda leaf, picked=picked: np.asarray(leaf)[picked], own)
+        loop = _start(mesh, slots, block)
+        records = []
+        for piece in range(pieces):
+            tick = np.int32(piece * PIECE * round(LOOK / DT))
+            loop, record = _piece(mesh, around, block, loop, tick)
+            records.append(jax.tree.map(lambda leaf, n=rows: np.asarray(leaf)[:n], record))
+            report(first * pieces + (piece + 1) * rows, count * pieces)
+        blocks.append(
+            jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :kept], *records)
+        )
+    return Sampled(
+        LOOK * np.arange(kept), *jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+    )
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _start(mesh: Mesh, slots: int, block: Any) -> Any:
+    """State and driver's memory before the first tick."""
+
+    def one(own: Lanes) -> Any:
+        v, at = own.velocity, own.pose
+        state = planar.initial_state(
+            own.car, DT, (at[0], at[1], at[2]), (v[0], v[1], v[2]), own.charge, slots
+        )
+        return jax.tree.map(
+            lambda leaf: jnp.asarray(leaf) if jnp.ndim(leaf) else leaf + jnp.zeros_like(own.charge),
+            (state, own.driver.reset(jax.random.key(0))),
+        )
+
+    cut = PartitionSpec("core")
+    return _on_cores(mesh, jax.vmap(one), (cut,))(block)
+
+
+@partial(jax.jit, static_argnums=0)
+def _piece(mesh: Mesh, walls: Any, block: Any, loop: Any, tick: Any) -> Any:
+    """The next `PIECE` samples: the motion at each, and the command that is asked for then."""
+    every = round(LOOK / DT)
+
+    def one(walls: Any, own: Lanes, loop: Any) -> Any:
+        def next_tick(carry: Any, count: Any) -> Any:
+            state, memory = carry
+            command, after = own.driver.act(memory, observed(state, count))
+            after = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, memory)
+            state = planar.step(own.car, walls, state, command, count, DT, own.floor)
+            return (state, after), command
+
+        def look(carry: Any, first: Any) -> Any:
+            counts = first + jnp.arange(every, dtype=jnp.int32)
+            after, commands = jax.lax.scan(next_tick, carry, counts)
+            asked = jax.tree.map(lambda leaf: leaf[0], commands)
+            return after, (carry[0].motion, asked, carry[0].wall_contacts)
+
+        firsts = tick + every * jnp.arange(PIECE, dtype=jnp.int32)
+        return jax.lax.scan(look, loop, firsts)
+
+    cut, same = PartitionSpec("core"), PartitionSpec()
+    lanes = jax.vmap(one, (None, 0, 0))
+    return _on_cores(mesh, lanes, (same, cut, cut))(walls, block, loop)
+
+
+def observed(state: State, count: Any) -> Observation:
+    """What a driver is told here."""
+    m = state.motion
+    known = Estimate(m.x, m.y, m.heading, m.vx, m.vy, m.yaw_rate)
+    time = DT * count.astype(m.x.dtype)
+    heard: Any = dict.fromkeys(Observation._fields, NOTHING)
+    return Observation(**heard | {"time": time, "sonar": (), "estimate": known})
+
+
+def _on_cores(mesh: Mesh, run: Callable[..., Any], inputs: Any) -> Callable[..., Any]:
+    """A share of the lanes on each core."""
+    made: Callable[..., Any] = jax.shard_map(
+        run, mesh=mesh, in_specs=inputs, out_specs=PartitionSpec("core"), check_vma=False
+    )
+    return made
+
+
+def commands(*steps: tuple[float, float, float]) -> Replay:
+    """Open-loop commands of up to `STEPS` steps: time, throttle, steering (rad)."""
+    # As many for all, so that they share a program.
+    padded = np.array([*steps, *[steps[-1]] * (STEPS - len(steps))]).T
+    return Replay(times=padded[0], throttle=padded[1], steering=padded[2])
+
+
+def batch(car: Car, count: int) -> Car:
+    """So many of one car, in 32 bits."""
+    many: Car = jax.tree.map(lambda leaf: np.broadcast_to(np.float32(leaf), (count,)), car)
+    return many

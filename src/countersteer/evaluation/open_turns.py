@@ -1,0 +1,325 @@
+"""Turns in the open: how long, and by what angle, a car still turns once it is stopped.
+
+A turn is stopped when its throttle is killed. What is measured is the yaw rate and the speed then,
+and what follows until the yaw rate is about nothing. The same measurement is made of simulated
+turns (`trial`) and of a real car's logs (`of_run`).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.drivers.open_turn import open_turn
+from countersteer.drivers.turning import Turning
+from countersteer.errors import InputError
+from countersteer.evaluation.open_drives import batch, drives
+from countersteer.evaluation.population import Population, draw
+from countersteer.evaluation.turns import sideslip
+from countersteer.runs.files import Table, read_table
+from countersteer.runs.run import Run, drawn_car, read_run
+from countersteer.tuning.windows import find_references, read_measured
+
+ON, OFF = 0.05, 0.02  # throttle that drives, and throttle that does not
+FAST = 1.0  # rad/s from which a car turns
+BEGIN = 0.3  # rad/s at which a turn has begun
+STILL = 0.1  # rad/s at which it has stopped
+LONGEST = 2.0  # s that stopping may take
+SLOWEST = 0.3  # m/s: slower ones tell nothing of a drift
+SAMPLE = 0.005  # s between samples of a log
+
+RUN_TIME = 3.2  # s of a simulated trial: run-up, turn, stop
+KILL = (1.0, 1.5)  # kill yaw rates: from so many rad/s to so much of the rate that is held
+SPIN = (0.25, 0.75)  # s after which the throttle is killed whatever the yaw rate
+
+COLUMNS = (
+    "hand",
+    "entry_speed_mps",
+    "kill_speed_mps",
+    "kill_yaw_rate_degps",
+    "time_to_stop_s",
+    "angle_to_stop_deg",
+    "peak_sideslip_deg",
+    "battery_charge",
+    "seed",
+    "kill_time_s",
+    "run",
+)
+WORDS = ("hand", "run")
+
+
+class Series(NamedTuple):
+    """A drive as samples; NaN where nothing is known. SI units, rad."""
+
+    time: np.ndarray
+    throttle: np.ndarray
+    steering: np.ndarray
+    vx: np.ndarray
+    vy: np.ndarray  # NaN where only wheels and a gyroscope tell
+    yaw_rate: np.ndarray
+
+
+class Stop(NamedTuple):
+    """A turn that was stopped. SI units, rad."""
+
+    hand: int
+    time: float  # of the kill
+    entry_speed: float
+    vx: float  # at the kill: what an encoder would tell
+    yaw_rate: float  # at the kill, in the turn's hand
+    duration: float
+    angle: float
+    peak_sideslip: float  # NaN where nothing tells it
+
+
+def stops(series: Series, undisturbed: bool = True) -> list[Stop]:
+    """The turns that were stopped, and came to a stop: `undisturbed` by throttle until then."""
+    time, rate = series.time, series.yaw_rate
+    drives = series.throttle > ON
+    held = np.abs(series.throttle) <= OFF
+    found = []
+    for kill in np.nonzero(drives[:-1] & held[1:])[0] + 1:
+        if not abs(rate[kill]) > FAST or not series.vx[kill] > SLOWEST:
+            continue
+        hand = int(np.sign(rate[kill]))
+        again = np.nonzero(~held[kill:])[0] if undisturbed else np.zeros(0, int)
+        last = min(
+            kill + (int(again[0]) if len(again) else len(time)),
+            int(np.searchsorted(time, time[kill] + LONGEST)),
+        )
+        ahead = hand * rate[kill:last]
+        if not np.any(ahead <= STILL):
+            continue
+        end = int(np.argmax(ahead <= STILL))
+        if not np.all(np.isfinite(ahead[: end + 1])):
+            continue
+        part = (ahead[end - 1] - STILL) / (ahead[end - 1] - ahead[end])
+        stopped = time[kill + end - 1] + part * (time[kill + end] - time[kill + end - 1])
+        steps = np.append(time[kill : kill + end], stopped)
+        angle = float(np.trapezoid(np.append(ahead[:end], STILL), steps))
+        slow = np.nonzero(~(hand * rate[:kill] >= BEGIN))[0]
+        begin = int(slow[-1]) + 1 if len(slow) else 0
+        during = slice(begin, kill + end + 1)
+        slip = np.abs(sideslip(series.vx, series.vy))[during]
+        known = bool(np.any(np.isfinite(series.vy[during])))
+        found.append(
+            Stop(
+                hand,
+                float(time[kill]),
+                float(np.hypot(series.vx[begin], np.nan_to_num(series.vy[begin]))),
+                float(series.vx[kill]),
+                float(hand * rate[kill]),
+                float(stopped - time[kill]),
+                angle,
+                float(np.max(slip)) if known else math.nan,
+            )
+        )
+    return found
+
+
+def row(stop: Stop, charge: float = math.nan, seed: float = math.nan, run: str = "") -> list[Any]:
+    """A stop as a row of the table, in the order of `COLUMNS`."""
+    return [
+        "left" if stop.hand > 0 else "right",
+        stop.entry_speed,
+        stop.vx,
+        math.degrees(stop.yaw_rate),
+        stop.duration,
+        math.degrees(stop.angle),
+        math.degrees(stop.peak_sideslip),
+        charge,
+        seed,
+        stop.time,
+        run,
+    ]
+
+
+def trial(
+    car: Car,
+    turning: Turning,
+    population: Population | None,
+    seeds: Sequence[int],
+    speeds: tuple[float, float],
+    charge: tuple[float, float] | None,
+    report: Callable[[int, int], None] = lambda *_: None,
+    lanes: int = 128,
+) -> list[list[Any]]:
+    """One turn for each seed, as rows; those that do not come to a stop in time are left out.
+
+    Hand, speed of entry, yaw rate at the kill and charge are drawn by the seed; so is the car,
+    where there is a population. The driver knows the nominal car.
+    """
+    count = len(seeds)
+    cars, charges, floor = batch(car, count), np.ones(count), None
+    drawn = np.array([np.random.default_rng([seed, 1]).uniform(size=5) for seed in seeds])
+    if population is not None:
+        varied = draw(population, car, None, seeds, np.float32)
+        cars, charges, floor = varied.cars, varied.charge, varied.floor
+    if charge is not None:
+        charges = charge[0] + (charge[1] - charge[0]) * drawn[:, 0]
+    entry = speeds[0] + (speeds[1] - speeds[0]) * drawn[:, 1]
+    hand = np.where(drawn[:, 2] < 0.5, 1, -1)
+    held = np.interp(entry, turning.speeds, turning.rate)
+    kill = KILL[0] + (KILL[1] * held - KILL[0]) * drawn[:, 3]
+    longest = SPIN[0] + (SPIN[1] - SPIN[0]) * drawn[:, 4]
+    drivers = [
+        open_turn(car, turning, float(v), int(h), float(k), float(t))
+        for v, h, k, t in zip(entry, hand, kill, longest, strict=True)
+    ]
+    velocity = np.stack([entry, np.zeros(count), np.zeros(count)], axis=1)
+    sampled = drives(
+        cars,
+        charges.astype(np.float32),
+        drivers,
+        velocity,
+        RUN_TIME,
+        floor=floor,
+        report=report,
+        lanes=lanes,
+    )
+    rows = []
+    for i, seed in enumerate(seeds):
+        m, c = sampled.motion, sampled.command
+        series = (c.throttle[i], c.steering[i], m.vx[i], m.vy[i], m.yaw_rate[i])
+        for stop in stops(Series(sampled.time, *series))[:1]:
+            rows.append(row(stop, float(charges[i]), int(seed)))
+    return rows
+
+
+def series_of(run: Run) -> Series:
+    """A run's drive: motion capture or the simulated truth, else gyroscope and wheel speed.
+
+    A sensor's lag is taken off. Raises `InputError` where neither is there.
+    """
+    found = find_references(read_measured(run, drawn_car(run.about)))
+    forward = found.get("vx_mps") or found.get("wheel_speed_mps")
+    turning = found.get("yaw_rate_radps")
+    if forward is None or turning is None:
+        raise InputError(
+            f"{run.path}: tells no speed and yaw rate: give truth.csv, or wheel_speed_mps and "
+            "gyro_radps in telemetry.csv"
+        )
+    commands = run.commands["time_s"]
+    time = np.arange(commands[0], commands[-1] + SAMPLE / 2, SAMPLE)
+    last = np.maximum(np.searchsorted(commands, time + 1e-6, side="right") - 1, 0)
+    sideways = found["vy_mps"].undone(time) if "vy_mps" in found else np.full(len(time), math.nan)
+    return Series(
+        time,
+        run.commands["throttle"][last],
+        run.commands["steering"][last],
+        forward.undone(time),
+        sideways,
+        turning.undone(time),
+    )
+
+
+def of_run(path: Path) -> list[list[Any]]:
+    """The turns of a run's folder that were stopped, as rows."""
+    run = read_run(path)
+    charge = float(run.about.get("battery_charge", math.nan))
+    return [row(stop, charge, run=path.name) for stop in stops(series_of(run))]
+
+
+def write_rows(path: Path, rows: Sequence[Sequence[Any]]) -> None:
+    """The table as `turns.csv`; an empty cell is not known."""
+    lines = [",".join(COLUMNS)]
+    lines += [",".join(_cell(value) for value in one) for one in rows]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, str | int):
+        return str(value)
+    return "" if math.isnan(value) else f"{value:.6g}"
+
+
+def as_table(rows: Sequence[Sequence[Any]]) -> Table:
+    """Rows as columns by name."""
+    columns = list(zip(*rows, strict=True)) if rows else [()] * len(COLUMNS)
+    return Table(
+        {
+            name: np.array(column, dtype=str if name in WORDS else float)
+            for name, column in zip(COLUMNS, columns, strict=True)
+        }
+    )
+
+
+def read_turns(path: Path) -> Table:
+    """Turns from a `turns.csv`, a folder that holds one, or a run's folder.
+
+    Raises `InputError` where a number is missing or is none that a stop can have.
+    """
+    if path.is_dir() and (path / "run.toml").exists():
+        return as_table(of_run(path))
+    file = path / "turns.csv" if path.is_dir() else path
+    if not file.exists():
+        raise InputError(f"{path}: no such table of turns, nor a run's folder")
+    table = read_table(file, COLUMNS[:6], text=WORDS)
+    other = ~np.isin(table["hand"], ("left", "right"))
+    if np.any(other):
+        raise InputError(f"{file}, line {int(np.argmax(other)) + 2}: hand must be left or right")
+    for name in COLUMNS[1:6]:
+        low = 0.0 if name != "angle_to_stop_deg" else -360.0
+        wrong = ~(table[name] >= low) | ~(table[name] <= 1e4)
+        if np.any(wrong):
+            line = int(np.argmax(wrong)) + 2
+            raise InputError(f"{file}, line {line}: {name} must be a number in [{low:g}, 10000]")
+    return table
+
+
+def draw_turns(table: Table, path: Path, title: str) -> None:
+    """A picture: time and angle to the stop over the yaw rate at the kill, by speed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharex=True)
+    for ax, name, label in (
+        (axes[0], "time_to_stop_s", "time to stop, s"),
+        (axes[1], "angle_to_stop_deg", "angle turned until stopped, °"),
+    ):
+        for hand, marker in (("left", "<"), ("right", ">")):
+            mine = table["hand"] == hand
+            dots = ax.scatter(
+                table["kill_yaw_rate_degps"][mine],
+                table[name][mine],
+                c=table["kill_speed_mps"][mine],
+                vmin=float(np.min(table["kill_speed_mps"], initial=9.0)),
+                vmax=float(np.max(table["kill_speed_mps"], initial=0.0)),
+                s=14,
+                marker=marker,
+                linewidths=0,
+                label=f"{hand} ({int(mine.sum())})",
+            )
+        ax.set_xlabel("yaw rate at the kill, °/s")
+        ax.set_ylabel(label)
+    axes[0].legend(frameon=False, fontsize=8)
+    figure.colorbar(dots, ax=axes, label="forward speed at the kill, m/s")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def summary(table: Table, tried: int | None) -> dict[str, Any]:
+    """What the table holds, in figures; names and units are those of the JSON."""
+    count = len(table["hand"])
+    result: dict[str, Any] = {"turns": count}
+    if tried is not None:
+        result = {"trials": tried, **result, "never_stopped": tried - count}
+    result["left"], result["right"] = (int(np.sum(table["hand"] == h)) for h in ("left", "right"))
+    for name in COLUMNS[1:7]:
+        values = table[name][np.isfinite(table[name])]
+        result[name] = (
+            {
+                "low": float(values.min()),
+                "median": float(np.median(values)),
+                "high": float(values.max()),
+            }
+            if len(values)
+            else None
+        )
+    return result

@@ -1,0 +1,1 @@
+"""Learning: from experience to a driver's numbers."""

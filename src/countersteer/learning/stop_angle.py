@@ -1,0 +1,42 @@
+"""How far a car still turns once it is stopped, learned from turns that were stopped."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from countersteer.drivers.policy import save_policy
+from countersteer.evaluation.open_turns import read_turns
+from countersteer.evaluation.stop_regression import Stops, about, regress_stops
+from countersteer.runs.files import Table
+
+
+def learn(sources: Sequence[Path], most: float, out: Path) -> Stops:
+    """Learn from tables of turns or runs, and write the policy; `most` as in `regress_stops`."""
+    found = regress_stops(read_all(sources), most)
+    save_policy(out, source(found, [path.name for path in sources]), stop_angle=found.stop_angle)
+    return found
+
+
+def read_all(paths: Sequence[Path]) -> Table:
+    """The turns of several tables or runs, one below the other."""
+    tables = [read_turns(path) for path in paths]
+    names = ("kill_speed_mps", "kill_yaw_rate_degps", "time_to_stop_s", "angle_to_stop_deg")
+    return Table({name: np.concatenate([table[name] for table in tables]) for name in names})
+
+
+def source(found: Stops, names: Sequence[str]) -> dict[str, str]:
+    """What the policy says of where its numbers are from."""
+    told = about(found)
+    errors = "; ".join(
+        f"{r['middle_mps']:.2f} m/s: offset ± {r['angle']['offset_error_deg']:.2g}°, slope ± "
+        f"{r['angle']['slope_error_s']:.2g} s, {r['turns']} turns"
+        for r in told["regions"]
+    )
+    low, high = told["yaw_rate_degps"]
+    return {
+        "stop_angle": f"learned from {told['turns']} turns of {', '.join(names)}",
+        "standard_errors": errors,
+        "valid": f"yaw rates of {low:.0f} to {high:.0f} °/s at the kill",
+        "left_out": f"{told['ran_on']} turns that ran on",
+    }

@@ -1,0 +1,81 @@
+"""Policies: a driver's numbers as plain data."""
+
+import dataclasses
+import math
+
+import jax
+import numpy as np
+import pytest
+
+from countersteer import cli
+from countersteer.drivers.policy import LIBRARY, TABLES, load_policy, save_policy
+from countersteer.errors import InputError
+
+WHOLE = (LIBRARY / "drift-turn.toml").read_text()
+
+
+def test_every_number_of_the_driver_stands_in_the_file():
+    for made, entries in TABLES.values():
+        assert [field.name for field in dataclasses.fields(made)] == list(entries)
+
+
+def test_the_library_is_in_si_units_inside():
+    policy = load_policy("drift-turn")
+    assert 0.1 < policy.turning.lock[0] < math.radians(45)
+    assert 1 < policy.turning.rate[0] < 8
+    assert np.all(policy.stop_angle.slope > 0)
+
+
+def test_what_is_written_reads_back(tmp_path):
+    policy = load_policy("drift-turn")
+    path = tmp_path / "p.toml"
+    save_policy(path, {"all": "the library"}, *policy)
+    for old, new in zip(
+        jax.tree.leaves(policy), jax.tree.leaves(load_policy(str(path))), strict=True
+    ):
+        np.testing.assert_allclose(new, old, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('kind = "drift-turn"', 'kind = "other"'), "kind must be \"drift-turn\", not 'other'"),
+        (("[turning]", "[turns]"), "unknown key turns; did you mean turning?"),
+        (("hold_p =", "hold_q ="), r"unknown key turning.hold_q; did you mean turning.hold_p"),
+        (("hold_p = 0.9\n", ""), "turning.hold_p is missing"),
+        (("hold_p = 0.9", 'hold_p = "a"'), r"turning.hold_p must be a number in \[-100, 100\]"),
+        (("hold_throttle = ", "hold_throttle = 5"), "turning.hold_throttle = .* outside its range"),
+        (("slope_s = [", "slope_s = [0.1, "), "stop_angle.slope_s must hold 3 numbers"),
+        (("slope_s = [", "slope_s = [9.0, "), r"stop_angle.slope_s\[0\] = 9 is outside its range"),
+        (("    1.4,\n", "    2.0,\n"), "turning.speed_mps must rise"),
+        (("kind", "kind ="), "not valid TOML"),
+    ],
+)
+def test_a_policy_that_is_wrong_is_told_by_key_and_range(tmp_path, change, message):
+    path = tmp_path / "p.toml"
+    assert change[0] in WHOLE
+    path.write_text(WHOLE.replace(change[0], change[1], 1))
+    with pytest.raises(InputError, match=message) as error:
+        load_policy(str(path))
+    assert "p.toml" in str(error.value)
+
+
+def test_a_policy_without_numbers_is_none(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text('kind = "drift-turn"\n')
+    with pytest.raises(InputError, match="holds no number"):
+        load_policy(str(path))
+
+
+def test_a_policy_drives_by_its_own_numbers(tmp_path):
+    from countersteer.car.files import load_car
+    from countersteer.course.files import load_course
+
+    path = tmp_path / "p.toml"
+    path.write_text(WHOLE.replace("hold_p = 0.9", "hold_p = 1.9"))
+    course, car = load_course("box"), load_car("rx7")
+    driver = cli.make_driver(str(path), course, car, None, 1)
+    assert driver.turning.hold_p == 1.9
+    assert cli.make_driver("drift-turn", course, car, None, 1).turning.hold_p == 0.9
+    with pytest.raises(InputError, match="cannot be read"):
+        cli.make_driver("none.toml", course, car, None, 1)
