@@ -366,6 +366,20 @@ def watched(
     return whole
 
 
+def rollouts(
+    simulator: Simulator,
+    drawn: Drawn,
+    drivers: Sequence[Driver],
+    seeds: Sequence[int],
+    laps: int,
+    longest: float,
+    report: Callable[[int, int], None] = lambda *_: None,
+    lanes: int = LANES,
+) -> Score:
+    """`watched` with nobody looking on."""
+    return watched(simulator, drawn, drivers, seeds, laps, longest, None, report, lanes)[0]
+
+
 def _rows(tree: Any, picked: np.ndarray) -> Any:
     """The picked trials of a batch."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[picked], tree)

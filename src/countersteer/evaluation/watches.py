@@ -5,7 +5,7 @@ Each is a `rollout.Watch`. Sums are kept, not records, so that thousands of tria
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,12 @@ import numpy as np
 from countersteer.car.parameter import Array, Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import STRAIGHT
+from countersteer.drivers.straighten import Lane
 from countersteer.estimation import dead_reckoning, pose, spikes
 from countersteer.estimation.estimate import Estimate
 from countersteer.evaluation.rollout import LOOK, Score
 from countersteer.simulator import LOCATING, Loop, Plan, Surroundings, observe
 from countersteer.world.chassis import Vector, dot, solve
-from countersteer.world.state import Motion
 
 SLIPS = math.radians(10)  # sideslip from which on the car drifts
 FASTER = 0.5  # m/s, below which sideslip means nothing
@@ -28,31 +28,6 @@ SAMPLE, SAMPLES = 20, 240  # looks between two samples of the normalised error, 
 FIT = 0.05  # m within which a ping is of the wall that it should be of
 PARTICLES = 2000
 SETTLED = (0.3, math.radians(15))  # m and rad from the truth
-
-
-class Corridors(NamedTuple):
-    """For each number of turns that were begun: the middle line of the corridor then."""
-
-    x: Array
-    y: Array
-    bearing: Array
-
-    def place(self, motion: Motion, turn: Scalar) -> tuple[Scalar, Scalar]:
-        """Offset to the left of the middle (m), and angle to it (rad)."""
-        bearing = self.bearing[turn]
-        away = -jnp.sin(bearing) * (motion.x - self.x[turn])
-        away = away + jnp.cos(bearing) * (motion.y - self.y[turn])
-        return away, motion.heading - bearing
-
-
-def corridors(course: Course, laps: int, dtype: Any) -> Corridors:
-    """Of a course of straights and corners."""
-    turns = course.turns_ahead(laps)
-    at = [course.start_distance] + [t.distance for t in turns]
-    at = [d % course.length if course.closed else d for d in at]
-    x, y = (np.interp(at, course.marks, course.line[:, i]) for i in (0, 1))
-    bearing = course.start[2] + np.cumsum([0.0] + [t.angle for t in turns])
-    return Corridors(*(np.asarray(value, dtype) for value in (x, y, bearing)))
 
 
 class Kept(NamedTuple):
@@ -88,20 +63,15 @@ class Kept(NamedTuple):
 class Errors:
     """Errors of what the driver is told, in a loop whose estimate is the velocity filter."""
 
-    corridors: Corridors
+    lane: Lane
     inside: Scalar  # 95 % of a chi-squared distribution with three degrees of freedom
 
     def begin(self, around: Surroundings, loop: Loop) -> Kept:
         """Nothing yet."""
+        del around
         dtype = jnp.result_type(loop.state.motion.x)
         zero, m = jnp.zeros((), dtype), loop.state.motion
-        told = Estimate(*[zero] * 6)
-        told = told._replace(gyro_bias=zero, friction=zero, friction_deviation=zero)
-        told = told._replace(battery=zero, battery_resistance=zero)
-        told = told._replace(
-            velocity_covariance=jax.tree.map(lambda _: zero, told.velocity_covariance),
-            pose_covariance=jax.tree.map(lambda _: zero, told.pose_covariance),
-        )
+        told = jax.tree.map(lambda _: zero, Estimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
         return Kept(
             *[zero] * 5,
             (zero,) * 3,
@@ -116,6 +86,7 @@ class Errors:
 
     def look(self, plan: Plan, around: Surroundings, loop: Loop, score: Score, kept: Kept) -> Kept:
         """One instant more."""
+        del score
         motion = loop.state.motion
         _, seen = observe(plan, around, loop)
         told = seen.estimate
@@ -142,7 +113,7 @@ class Errors:
         turn = jnp.asarray(getattr(loop.memory, "turn", 0))
         own = getattr(loop.memory, "straight", loop.memory)
         phase = getattr(loop.memory, "phase", STRAIGHT)
-        offset, angle = self.corridors.place(motion, turn)
+        offset, angle, _ = self.lane.place(turn, motion)
         straight = jnp.where(warm & (phase == STRAIGHT) & (jnp.abs(angle) < 0.3), 1.0, 0.0)
         offset_error, angle_error = (own.offset - offset) ** 2, (own.error - angle) ** 2
         variances = (jnp.inf, jnp.inf)
@@ -189,7 +160,7 @@ class Errors:
             kept.doubts + one(doubted),
             kept.strays + one(stray),
             kept.passed + one(stray & ~held),
-            told,
+            jax.tree.map(lambda value: jnp.asarray(value, motion.charge.dtype), told),
             motion.charge,
             reckoning,
             spike,
@@ -231,7 +202,8 @@ class Places:
         none = jnp.full_like(self.turns, jnp.inf)
         still = still._replace(heading=loop.estimate.mean[3])
         picked = jax.random.randint(key, (self.particles,), 0, len(self.uniform[0]))
-        cloud = self.place.memory(*(v[picked] for v in self.uniform), _slim(still), key)
+        x, y, heading = (jnp.asarray(value)[picked] for value in self.uniform)
+        cloud = self.place.memory(x, y, heading, _slim(still), key)
         return cloud, Placed(none, none, zero, zero + jnp.inf)
 
     def look(
@@ -281,6 +253,6 @@ def _slim(estimate: Estimate) -> Estimate:
 def anywhere(course: Course, place: pose.PoseFilter, count: int) -> tuple[Array, Array, Array]:
     """Poses drawn evenly from the corridor, for `Places.uniform`."""
     zero = jnp.zeros((), place.walls.dtype)
-    still = Estimate(*[zero] * 6)
+    still = jax.tree.map(lambda _: zero, Estimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     cloud = place.uniform(course, jax.random.key(0), count, still)
     return np.asarray(cloud.x), np.asarray(cloud.y), np.asarray(cloud.heading)
