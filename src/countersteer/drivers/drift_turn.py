@@ -157,7 +157,7 @@ class DriftTurn:
 
     def _approach(
         self, memory: Memory, seen: Observation, error: Scalar, angle: Scalar, dt: Scalar
-    ) -> tuple[Scalar, Scalar, tuple[Scalar, ...]]:
+    ) -> tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]:
         """Distance to the next corner and its variance: odometry, and the wall ahead.
 
         The wall behind a corner by an angle a stands w/2 beyond it, its normal turned by 90° - a

@@ -112,9 +112,18 @@ def initial_memory(car: Car, pose: tuple[float, float, float], dtype: np.dtype) 
     gyro, accel = car.sensors.gyroscope, car.sensors.accelerometer
     x, y, heading = (jnp.asarray(value, dtype) for value in pose)
     zero, one, none = dtype.type(0), dtype.type(1), np.int32(0)
-    spread = (0.1, 0.05, 0.05, START, GYRO_BIAS, ACCEL_BIAS, ACCEL_BIAS, 0.01)
+    spread: tuple[float, ...] = (0.1, 0.05, 0.05, START, GYRO_BIAS, ACCEL_BIAS, ACCEL_BIAS, 0.01)
     quiet = Sense(zero, none, none, np.int32(STEADY))
-    mean = (zero, zero, zero, heading, gyro.bias, accel.bias_x, accel.bias_y, zero)
+    mean: tuple[Scalar, ...] = (
+        zero,
+        zero,
+        zero,
+        heading,
+        gyro.bias,
+        accel.bias_x,
+        accel.bias_y,
+        zero,
+    )
     told = car.sensors.position.reports != "none"
     if told:
         mean, spread = (*mean, x, y), (*spread, PLACE, PLACE)
@@ -371,13 +380,14 @@ def update(
 
     # Where the car was, as told from outside.
     position = memory.position
-    if position is not None:
+    told_x, told_y = readings.position_x, readings.position_y
+    if position is not None and told_x is not None and told_y is not None:
         part = sensors.position
-        position, placed, told = heard(position, readings.position_x, part.rate, tick, dt)
+        position, placed, told = heard(position, told_x, part.rate, tick, dt)
         late = seconds(settled - position.tick) + part.delay
         for state, reading, row in (
-            (X, readings.position_x, {VX: -late * cosine, VY: late * sine}),
-            (Y, readings.position_y, {VX: -late * sine, VY: -late * cosine}),
+            (X, told_x, {VX: -late * cosine, VY: late * sine}),
+            (Y, told_y, {VX: -late * sine, VY: -late * cosine}),
         ):
             then = mean[state] + sum(slope * mean[i] for i, slope in row.items())
             mean, covariance, _ = correct(

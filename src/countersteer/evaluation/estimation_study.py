@@ -89,7 +89,7 @@ def figures(of: Trials, kept: Any) -> dict[str, float]:
         return math.sqrt(float(np.sum(total)) / max(float(np.sum(count)), 1.0))
 
     # A car's errors hang together over a drive, so a drive counts as one draw of three.
-    low, high = chi2.ppf([0.025, 0.975], 3 * len(each)) / len(each)
+    low, high = (float(chi2.ppf(p, 3 * len(each))) / len(each) for p in (0.025, 0.975))
     return {
         "drives": len(each),
         "drifting_s": LOOK * float(np.sum(kept.drifting)),

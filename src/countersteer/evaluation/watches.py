@@ -5,7 +5,7 @@ Each is a `rollout.Watch`. Sums are kept, not records, so that thousands of tria
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -72,16 +72,13 @@ class Errors:
         dtype = jnp.result_type(loop.state.motion.x)
         zero, m = jnp.zeros((), dtype), loop.state.motion
         told = jax.tree.map(lambda _: zero, Estimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        return Kept(
-            *[zero] * 5,
-            (zero,) * 3,
-            jnp.full(SAMPLES, jnp.nan, dtype),
-            *[zero] * 12,
-            told,
-            zero,
-            dead_reckoning.initial_memory((m.x, m.y, m.heading), dtype),
-            spikes.initial_memory(np.dtype(dtype)),
-            zero,
+        none: list[Any] = [zero] * len(Kept._fields)
+        return Kept(*none)._replace(
+            alone=(zero,) * 3,
+            squares=jnp.full(SAMPLES, jnp.nan, dtype),
+            estimate=told,
+            reckoning=dead_reckoning.initial_memory((m.x, m.y, m.heading), dtype),
+            spike=spikes.initial_memory(np.dtype(dtype)),
         )
 
     def look(self, plan: Plan, around: Surroundings, loop: Loop, score: Score, kept: Kept) -> Kept:
