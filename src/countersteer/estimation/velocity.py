@@ -36,8 +36,9 @@ ACCEL_BIAS = 0.06  # m/s²
 WANDER = 0.001  # of the gyroscope's bias, rad/s per root second
 START = 0.02  # heading at the start, rad
 JERK = 1.5  # by which the yaw rate changes, rad/s per root second
-HOLDS = 0.010  # m/s: how well a wheel that holds is known to roll, and an axle not to slide
-CREEPS = 0.35  # part by which the rear axle's creep is not what its tyre's stiffness makes of it
+HOLDS = 0.010  # m/s: how well a wheel that holds is known to roll,
+KEEPS = 0.006  # m/s: and an axle that holds not to slide
+CREEPS = 0.2  # part by which the rear axle's creep is not what its tyre's stiffness makes of it
 MEMORY = 0.2  # s for which that error stays the same
 SLIDES = 1.5  # m/s: the same where the axle slides
 ADHERES = 0.12  # rad of slip angle up to which an axle holds
@@ -373,7 +374,7 @@ def update(
         covariance,
         {VY: 1.0, RATE: -behind},
         creep - (mean[VY] - behind * mean[RATE]),
-        (HOLDS + CREEPS * jnp.abs(creep)) ** 2 * 2 * MEMORY * per,
+        (KEEPS + CREEPS * jnp.abs(creep)) ** 2 * 2 * MEMORY * per,
         holds & (h_settled > 0),
         GATE,
     )

@@ -342,7 +342,7 @@ def sensing(name: str, seeds: Sequence[int]) -> list[str]:
         car = load_car(name, settings)
         for where in COURSES:
             course = load_course(where)
-            score = trials(course, car, seeds).run(partial(drift_turn, course, car, by=by))
+            score, _ = errors(course, car, seeds, partial(drift_turn, by=by))
             told = results(score, seeds)
             low, high = told["success_interval"]
             share, error = told["drift_share"], told["heading_error_rms_deg"]

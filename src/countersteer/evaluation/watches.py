@@ -86,7 +86,7 @@ class Errors:
         del score
         motion = loop.state.motion
         _, seen = observe(plan, around, loop)
-        told = seen.estimate
+        told = jax.tree.map(lambda value: jnp.asarray(value, motion.charge.dtype), seen.estimate)
         time = seen.time
         warm = time > WARM
 
@@ -157,7 +157,7 @@ class Errors:
             kept.doubts + one(doubted),
             kept.strays + one(stray),
             kept.passed + one(stray & ~held),
-            jax.tree.map(lambda value: jnp.asarray(value, motion.charge.dtype), told),
+            told,
             motion.charge,
             reckoning,
             spike,
