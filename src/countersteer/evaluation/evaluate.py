@@ -14,7 +14,7 @@ from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.evaluation.population import Population, draw
-from countersteer.evaluation.rollout import REACHED, STATUS, Score, Watch, watched
+from countersteer.evaluation.rollout import LANES, REACHED, STATUS, Score, Watch, watched
 from countersteer.link.link import Link
 from countersteer.sensing.faults import Fault
 from countersteer.simulator import Simulator
@@ -54,6 +54,7 @@ class Trials:
         watch: Watch | None,
         report: Callable[[int, int], None] = lambda *_: None,
         faults: tuple[Fault, ...] = (),
+        lanes: int = LANES,
     ) -> tuple[Score, Any]:
         """The same with what `watch` has kept, and with sensors that fail as each trial's do."""
         drawn = draw(self.population, self.car, self.course, self.seeds, np.float32, self.speeds)
@@ -74,7 +75,8 @@ class Trials:
             longest,
             watch,
             report,
-            faults=faults,
+            lanes,
+            faults,
         )
 
     def about(self) -> dict[str, Any]:
