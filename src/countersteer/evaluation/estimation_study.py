@@ -405,7 +405,8 @@ itself tells how fast it turns, so the estimate is as far off as the cars are sp
 A ping is *of the right wall* within {fit:g} cm of where the walls, which the judge knows, let it
 be. The spike filter (`estimation/spikes.py`) costs no delay for a wall that comes nearer as the car
 drives. A wall that comes into view at once is held back for one ping, 25 ms at 40 Hz: that is what
-its alarms cost. The driver looks at the same pings against its odometry, and wants two in a row
+its alarms cost. Pings that are too short are echoes of edges; two of them in a row are a wall to it.
+The driver looks at the same pings against its odometry, and wants two in a row
 that follow the one before.
 
 ## The pose from anywhere
