@@ -6,12 +6,21 @@ import math
 import jax
 import numpy as np
 import pytest
+import tomli_w
 
 from countersteer import cli
-from countersteer.drivers.policy import LIBRARY, TABLES, load_policy, save_policy
+from countersteer.drivers.policy import TABLES, load_policy, policy_tables, save_policy
+from countersteer.drivers.stop_angle import StopAngle
 from countersteer.errors import InputError
+from test_open_turns import TURNING
 
-WHOLE = (LIBRARY / "drift-turn.toml").read_text()
+STOPS = StopAngle(
+    speeds=np.array([1.0, 1.6, 2.2]),
+    offset=np.zeros(3),
+    slope=np.full(3, 0.12),
+    deviation=np.full(3, 0.1),
+)
+WHOLE = tomli_w.dumps({"kind": "drift-turn", **policy_tables(TURNING, STOPS)})
 
 
 def test_every_number_of_the_driver_stands_in_the_file():
@@ -76,6 +85,7 @@ def test_a_policy_drives_by_its_own_numbers(tmp_path):
     course, car = load_course("box"), load_car("rx7")
     driver = cli.make_driver(str(path), course, car, None, 1)
     assert driver.turning.hold_p == 1.9
-    assert cli.make_driver("drift-turn", course, car, None, 1).turning.hold_p == 0.9
+    own = cli.make_driver("drift-turn", course, car, None, 1).turning
+    assert own.hold_p == load_policy("drift-turn").turning.hold_p != 1.9
     with pytest.raises(InputError, match="cannot be read"):
         cli.make_driver("none.toml", course, car, None, 1)

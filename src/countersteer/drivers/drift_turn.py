@@ -13,7 +13,7 @@ from countersteer.car.parameter import Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers import policy, straighten
 from countersteer.drivers.driver import Command, Observation, paced
-from countersteer.drivers.stop_angle import StopAngle, interpolate
+from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.straighten import Straighten
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
@@ -80,7 +80,7 @@ class DriftTurn:
     front: int = dataclasses.field(metadata={"static": True})
     lidar: Lidar | None = None  # where the car has one, it looks for the corner instead
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
-    linked: Scalar = 0.0  # 1: a turn begins as soon as the one before has ended
+    linked: Scalar = 0.0  # 1: a turn begins as soon as the one before is stopped, walls or not
     longest: Scalar = 1.2  # s that a phase of a turn may take
 
     def reset(self, key: jax.Array) -> Memory:
@@ -103,19 +103,23 @@ class DriftTurn:
         corner, doubt, spikes = self._approach(memory, seen, straight.error, angle, dt)
 
         speed = jnp.maximum(estimate.vx, 0.5)
-        lead = interpolate(own.speeds, own.lead, speed) * jnp.tan(
+        lead = own.begins_at(speed, estimate.friction) * jnp.tan(
             jnp.minimum(jnp.abs(angle), 2.1) / 2
         )
         lined_up = jnp.abs(straight.error) < 0.5
-        near = ((corner < lead) & lined_up) | (self.linked > 0)
-        begins = (memory.phase == STRAIGHT) & near & (angle != 0)
+        near = (memory.phase == STRAIGHT) & (corner < lead) & lined_up
+        fast = (memory.turn > 0) | (estimate.vx > 0.9 * self.straight.speed)
+        free = (memory.phase == STRAIGHT) | (memory.phase == SETTLE)
+        begins = jnp.where(self.linked > 0, free & fast, near) & (angle != 0)
         straight = self.straight.turned(straight, angle + (1 - self.carry) * straight.error, begins)
         hand = jnp.where(begins, jnp.sign(angle), memory.hand)
         entry = jnp.where(begins, speed, memory.entry)
 
         left_over = -hand * straight.error
         rate = hand * estimate.yaw_rate
-        missing = left_over - self.stop_angle.angle(speed, jnp.maximum(rate, 0.0))
+        still = self.stop_angle.angle(speed, jnp.maximum(rate, 0.0))
+        slip = -hand * jnp.arctan2(estimate.vy, speed)
+        missing = left_over - still + own.beyond(slip, still)
         late = now - memory.since > self.longest
         stops = (memory.phase == SPIN) & ((missing <= 0) | late)
         settles = (memory.phase == STOP) & ((rate < own.settled) | late)
@@ -127,9 +131,15 @@ class DriftTurn:
             phase = jnp.where(happens, into, phase)
         changed = begins | stops | settles | ends
 
-        slip = jnp.arctan2(estimate.vy + self.front_axle * estimate.yaw_rate, speed)
-        hold = -own.hold_p * straight.error - own.hold_d * estimate.yaw_rate + own.hold_slip * slip
-        spin, stop = own.spin(entry, rate), own.stop(entry, missing)
+        front_slip = jnp.arctan2(estimate.vy + self.front_axle * estimate.yaw_rate, speed)
+        hold = (
+            -own.hold_p * straight.error
+            - own.hold_d * estimate.yaw_rate
+            + own.hold_slip * front_slip
+        )
+        battery = jnp.clip(estimate.battery, 0.5, 1.2)
+        spin = own.spin(entry, rate, estimate.friction, battery)
+        stop = own.stop(entry, missing)
         on = self.straight.command(straight, seen, self.straight.speed)
         steering, throttle = on.steering, on.throttle
         for which, lock, power in (

@@ -83,6 +83,10 @@ TABLES: dict[str, tuple[type, dict[str, Entry]]] = {
             "hold_d": Entry("hold_d", False, "s", -10, 10),
             "hold_slip": Entry("hold_slip", False, "1", -10, 10),
             "hold_throttle": Entry("hold_throttle", False, "1", -1, 1),
+            "slip_aim": Entry("slip_aim", False, "rad", 0, 90),
+            "slip_gain": Entry("slip_gain", False, "1", -10, 10),
+            "lead_grip": Entry("lead_grip", False, "1", -10, 10),
+            "rate_grip": Entry("rate_grip", False, "1", -10, 10),
         },
     ),
 }

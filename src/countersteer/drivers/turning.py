@@ -1,8 +1,12 @@
 """The laws of a turn: what is asked of the car over speed of entry and yaw rate."""
 
+import jax.numpy as jnp
+
 from countersteer.car.parameter import Array, Scalar, pytree
 from countersteer.drivers.driver import Command
 from countersteer.drivers.stop_angle import interpolate
+
+MOST = 0.3  # rad of sideslip that is made up for at most
 
 
 @pytree
@@ -25,13 +29,37 @@ class Turning:
     hold_d: Scalar  # lock per yaw rate, s
     hold_slip: Scalar  # part of the front wheels' sideslip that they follow
     hold_throttle: Scalar  # throttle while it settles
+    slip_aim: Scalar = 0.6  # sideslip that a turn is to reach, rad
+    slip_gain: Scalar = 0.0  # angle turned beyond the target per sideslip that would be missing
+    lead_grip: Scalar = 0.0  # part by which a turn is begun earlier per part of friction missing
+    rate_grip: Scalar = 0.0  # part by which the yaw rate is held lower per part of it missing
 
-    def spin(self, entry: Scalar, rate: Scalar) -> Command:
-        """Wheels over, throttle high: for a left turn. `rate` is the yaw rate."""
+    def begins_at(self, speed: Scalar, grip: Scalar) -> Scalar:
+        """Distance to a corner of 90° at which the turn begins (m).
+
+        `grip` is the friction that is felt at the rear, over the nominal car's.
+        """
+        return interpolate(self.speeds, self.lead, speed) * (1 + self.lead_grip * (1 - grip))
+
+    def spin(
+        self, entry: Scalar, rate: Scalar, grip: Scalar = 1.0, battery: Scalar = 1.0
+    ) -> Command:
+        """Wheels over, throttle high: for a left turn. `rate` is the yaw rate.
+
+        `battery` is the voltage that is felt, over the nominal car's.
+        """
         lock = interpolate(self.speeds, self.lock, entry)
-        held = interpolate(self.speeds, self.rate, entry)
+        held = interpolate(self.speeds, self.rate, entry) * (1 + self.rate_grip * (grip - 1))
         throttle = interpolate(self.speeds, self.throttle, entry)
-        return Command(throttle, lock + self.rate_gain * (held - rate))
+        return Command(throttle / battery, lock + self.rate_gain * (held - rate))
+
+    def beyond(self, slip: Scalar, still: Scalar) -> Scalar:
+        """How far to turn beyond the target, so that the car slides as it is meant to (rad).
+
+        While it is stopped the car hardly changes its way: the sideslip (`slip`, in the turn's
+        hand) grows by about the angle that it still turns.
+        """
+        return self.slip_gain * jnp.clip(self.slip_aim - (slip + still), -MOST, MOST)
 
     def stop(self, entry: Scalar, missing: Scalar) -> Command:
         """Wheels back, throttle none: for a left turn of which so much angle would be missing."""

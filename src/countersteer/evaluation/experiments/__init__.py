@@ -13,6 +13,7 @@ NAMES = {
     "drift-turn": "one turn in all its signals",
     "control-rate": "10 Hz by radio or 1000 Hz on board, open or closed loop, two batteries",
     "battery": "the same commands at four charges and three wears",
+    "linked-turns": "four turns in a row without straightening: how far the heading drifts",
     "narrowest-corner": "the narrowest corner passed, and how fast, by grip and by drift",
 }
 

@@ -1,0 +1,94 @@
+"""Four turns of 90° linked without straightening, with and without carrying errors over.
+
+On open floor, on the sensors of cars drawn around the nominal one: each turn begins as soon as the
+one before is stopped. Carried over, a turn's error is part of the next one's target; else each
+turn counts from the heading at which it begins. There are no walls to look at, so the gyroscope's
+drift and the heading at the start are in both.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.course.course import Course, Turn
+from countersteer.drivers.drift_turn import drift_turn
+from countersteer.evaluation.experiments.found import Found, Report, silent
+from countersteer.evaluation.population import draw, load_population
+from countersteer.evaluation.rollout import rollouts
+from countersteer.simulator import Simulator
+
+TRIALS = 1000
+TURNS = 4
+SPEED = 2.0  # m/s
+LONGEST = 8.0  # s
+FAR = 1e4  # m
+
+
+def open_floor(angle: float = -math.pi / 2) -> Course:
+    """A line without walls, and turns that nothing but the driver brings about."""
+    line = np.array([[0.0, 0.0], [FAR, 0.0]])
+    turns = tuple(Turn(float(n), angle) for n in range(1, TURNS + 1))
+    none = np.zeros((0, 4))
+    return Course("open floor", 1.4, False, line, none, turns, (0.0, 0.0, 0.0), 0.0, FAR)
+
+
+def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS) -> Found:
+    """Over random cars; the heading's error is that at the end of the last turn."""
+    course, seeds = open_floor(), range(trials)
+    drawn = draw(load_population("around"), car, course, seeds, np.float32)
+    small = jax.tree.map(np.float32, car)
+    errors, slips = {}, {}
+    for i, (label, carry) in enumerate((("carried over", 1.0), ("each by itself", 0.0))):
+        driver = dataclasses.replace(drift_turn(course, car, SPEED), linked=1.0, carry=carry)
+        simulator = Simulator(course, small, driver)
+        score = rollouts(
+            simulator,
+            drawn,
+            [driver] * trials,
+            seeds,
+            1,
+            LONGEST,
+            lambda done, of, i=i: report(i * of + done, 2 * of),  # type: ignore[misc]  # one type
+        )
+        error = np.degrees(score.turns.error[:, -1])
+        ended = np.isfinite(score.turns.end[:, -1])
+        errors[label] = np.where(ended, error, math.nan)
+        slips[label] = np.degrees(score.turns.peak_sideslip)
+    figures = {label: _figures(values) for label, values in errors.items()}
+    said = "; ".join(
+        f"{label}: {f['rms_deg']:.1f}° RMS, {f['p95_deg']:.1f}° in 95 % of {f['ended']} trials"
+        for label, f in figures.items()
+    )
+    text = (
+        f"{TURNS} turns of 90° with {name}, linked without straightening, at {SPEED:g} m/s, "
+        f"{trials} random cars; heading at the end, less that of {TURNS} turns. {said}."
+    )
+
+    def paint(figure: Any) -> None:
+        axes = figure.add_subplot()
+        bins = np.linspace(-40, 40, 81)
+        for label, values in errors.items():
+            axes.hist(values, bins, histtype="step", linewidth=1.5, label=label)
+        axes.set_xlabel(f"heading error after {TURNS} linked turns, °")
+        axes.set_ylabel("trials")
+        axes.legend(frameon=False)
+
+    table: dict[str, Any] = {"seed": list(seeds)}
+    for label, values in errors.items():
+        table[f"heading_error_{label.replace(' ', '_')}_deg"] = values
+    return Found(table, figures, text, paint, (7.0, 4.0))
+
+
+def _figures(errors: np.ndarray) -> dict[str, float]:
+    """Of the trials whose last turn ended."""
+    values = errors[np.isfinite(errors)]
+    return {
+        "ended": len(values),
+        "rms_deg": float(np.sqrt(np.mean(values**2))),
+        "mean_deg": float(np.mean(values)),
+        "p95_deg": float(np.percentile(np.abs(values), 95)),
+    }
