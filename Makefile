@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; 
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: drive test check accuracy recovery bench notebook clean
+.PHONY: drive test check accuracy recovery estimation bench notebook clean
 
 drive: $(READY)
 	$(BIN)/countersteer drive box
@@ -24,6 +24,10 @@ accuracy: $(READY)
 # Twenty fits: an hour or more on two cores.
 recovery: $(READY)
 	$(BIN)/python -m countersteer.evaluation.recovery docs/recovery.md
+
+# Some twenty programs to compile, then 256 cars in each: ten minutes or more on two cores.
+estimation: $(READY)
+	$(BIN)/python -m countersteer.evaluation.estimation_study docs/estimation.md
 
 bench: $(READY)
 	$(BIN)/countersteer bench --out docs/speed.md

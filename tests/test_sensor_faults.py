@@ -175,3 +175,12 @@ def test_a_wrong_fault_is_refused_in_one_line(
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(says, line)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("sensor", ["sonar", "encoder", "gyroscope", "accelerometer"])
+def test_the_car_keeps_off_the_walls(sensor: str, kind: str) -> None:
+    """On a straight. That it knows no place from outside makes it the plain car."""
+    record = drive(failing((sensor, kind)), 8.0, nominal=load_car("rx7"))
+    assert not np.any(record.wall_contacts)
+    assert record.turn[-1] >= 3

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.car import Car
+from countersteer.car.car import Car, Lidar
 from countersteer.car.parameter import Array, Scalar, pytree
 from countersteer.course.along import Legs, legs_of
 from countersteer.course.course import Course
@@ -18,6 +18,7 @@ from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.straighten import Straighten
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
+from countersteer.estimation import lidar_walls
 
 STRAIGHT, SPIN, STOP, SETTLE = 0, 1, 2, 3
 SPEED = 2.0  # m/s, unless another is asked for
@@ -25,6 +26,7 @@ NEWS = 0.03  # m, standard deviation of what the front sonar says of the corner'
 DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
 SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
 GATE = 3.0  # standard deviations beyond which a reading is a spike
+FOLLOWS, STEADY = 0.15, 2  # m from one reading to the next at most, and how often in a row
 AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
 
 
@@ -42,6 +44,7 @@ class Memory(NamedTuple):
     heard: Scalar  # the front sonar's last reading, m
     odd: Scalar  # by how much the last that was not believed differed, m
     odds: Scalar  # how many in a row agreed on that
+    follows: Scalar  # how many readings in a row followed the one before
     straight: straighten.Memory
 
     @property
@@ -81,6 +84,7 @@ class DriftTurn:
     front: int = dataclasses.field(metadata={"static": True})
     legs: Legs
     by: str = dataclasses.field(default="wall", metadata={"static": True})
+    lidar: Lidar | None = None  # where the car has one, it looks for the corner instead
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
     linked: Scalar = 0.0  # 1: a turn begins as soon as the one before is stopped, walls or not
     longest: Scalar = 1.2  # s that a phase of a turn may take
@@ -88,7 +92,7 @@ class DriftTurn:
     def reset(self, key: jax.Array) -> Memory:
         """Straight ahead, a corridor's length away from the first corner."""
         gap = jnp.asarray(self.gaps)[0]
-        first = (STRAIGHT, 0, 0.0, 0.0, 1.0, 0.0, gap, DOUBT**2, math.inf, 0.0, 0)
+        first = (STRAIGHT, 0, 0.0, 0.0, 1.0, 0.0, gap, DOUBT**2, math.inf, 0.0, 0, 0)
         return Memory(*first, self.straight.reset(key))
 
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
@@ -174,26 +178,38 @@ class DriftTurn:
 
     def _approach(
         self, memory: Memory, seen: Observation, error: Scalar, angle: Scalar, dt: Scalar
-    ) -> tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar]]:
+    ) -> tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]:
         """Distance to the next corner and its variance: odometry, and the wall ahead.
 
         The wall behind a corner by an angle a stands w/2 beyond it, its normal turned by 90° - a
         from the heading: from a distance c before the corner it is c sin a + w/2 away, and an
         echo comes from within the cone, so from as much farther as the cone is short of the normal.
         A reading that odometry does not expect is a spike, until several in a row agree; one that
-        stands still while the car moves tells nothing. One that is expected is believed at once.
+        stands still while the car moves tells nothing, nor does one that leaps: of many spikes some
+        would be expected. One that follows those before and is expected is believed at once.
         """
         along = seen.estimate.vx * jnp.cos(error) - seen.estimate.vy * jnp.sin(error)
         corner = memory.corner - dt * along
         doubt = memory.doubt + dt * SLIPPING**2
+        if self.straight.by == "pose":
+            corner = self.straight.lane.place(memory.turn, seen.estimate)[2]
+            return corner, doubt, (memory.heard, memory.odd, memory.odds, memory.follows)
         heard = seen.sonar[self.front]
         came = heard.came(dt)
+        near = jnp.abs(heard.value - memory.heard) < FOLLOWS
+        follows = jnp.where(came, jnp.where(near, memory.follows + 1, 0), memory.follows)
         stuck = (heard.value == memory.heard) & (along > 0.5)
         looks = (jnp.abs(error) < 0.3) & (memory.phase == STRAIGHT) & jnp.isfinite(heard.value)
-        fresh = came & looks & ~stuck
+        fresh = came & looks & ~stuck & (follows >= STEADY)
         sine = jnp.maximum(jnp.sin(jnp.abs(angle)), 0.5)
         short = jnp.maximum(jnp.abs(math.pi / 2 - jnp.abs(angle)) - self.cone, 0.0)
         told = (heard.value * jnp.cos(short) - self.width / 2) / sine + self.front_x
+        if self.lidar is not None and seen.lidar is not None:
+            offset = memory.straight.offset
+            told, sees = lidar_walls.corner_ahead(
+                self.lidar, self.width, seen.lidar.value, error, offset, angle
+            )
+            fresh = seen.lidar.came(dt) & (memory.phase == STRAIGHT) & sees
         news = jnp.where(fresh, told - corner, 0.0)
         likely = news**2 < GATE**2 * (doubt + NEWS**2)
         agrees = jnp.where(jnp.abs(news - memory.odd) < AGREE, memory.odds + 1, 1)
@@ -204,6 +220,7 @@ class DriftTurn:
             jnp.where(came, heard.value, memory.heard),
             jnp.where(fresh, (1 - gain) * news, memory.odd),
             odds,
+            follows,
         )
         return corner + gain * news, (1 - gain) * doubt, spikes
 
@@ -216,11 +233,13 @@ def drift_turn(
     turning: Turning | None = None,
     stop_angle: StopAngle | None = None,
     by: str | None = None,
+    straight_by: str = "filter",
 ) -> DriftTurn:
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
 
-    Laws that are not given are those of the library's policy. `by` is "wall" or "pose"; by default
-    what the roundest corner asks for. Where the centre line's radius R is over half the width w,
+    Laws that are not given are those of the library's policy. `straight_by` is what it straightens
+    by, as in `Straighten`. `by`, what tells where a corner is, is "wall" or "pose"; by default what
+    the roundest corner asks for. Where the centre line's radius R is over half the width w,
     the wall ahead stands oblique by more than asin(R / (R + w/2)) = 30°, and is no longer where
     that of a mitred corner would be.
 
@@ -239,7 +258,9 @@ def drift_turn(
     if by is None:
         by = "pose" if any(t.radius > width / 2 for t in turns) else "wall"
     return DriftTurn(
-        straight=straighten.straighten(course, car, SPEED if speed is None else speed),
+        straight=straighten.straighten(
+            course, car, SPEED if speed is None else speed, straight_by, laps
+        ),
         turning=turning or policy.library().turning,
         stop_angle=stop_angle or policy.library().stop_angle,
         angles=np.array([t.angle for t in turns] + [0.0]),
@@ -251,4 +272,5 @@ def drift_turn(
         front=front,
         legs=legs_of(course, laps),
         by=by,
+        lidar=car.sensors.lidar if car.sensors.lidar.beams else None,
     )

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Scalar, pytree
+from countersteer.car.parameter import Array, Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Command, Observation, paced
 from countersteer.errors import InputError
@@ -28,6 +29,33 @@ class Memory(NamedTuple):
     time: Scalar
     walls: Any  # the filter's; () without
     command: Command  # the last
+    turned: Scalar = 0  # corners that are behind
+
+
+class Lane(NamedTuple):
+    """Corridors by the number of corners that are behind: arrays of one number a corridor."""
+
+    x: Array  # a place on the middle line: the corner that the corridor ends in, m
+    y: Array
+    bearing: Array  # rad
+
+    def place(self, number: Scalar, estimate: Any) -> tuple[Scalar, Scalar, Scalar]:
+        """Of a pose in a corridor: offset to the left, angle, and distance to its end."""
+        bearing = jnp.asarray(self.bearing)[number]
+        cosine, sine = jnp.cos(bearing), jnp.sin(bearing)
+        dx = estimate.x - jnp.asarray(self.x)[number]
+        dy = estimate.y - jnp.asarray(self.y)[number]
+        return cosine * dy - sine * dx, estimate.heading - bearing, -cosine * dx - sine * dy
+
+
+def lane(course: Course, laps: int = 1) -> Lane:
+    """The corridors of a course from its start; the last ends at the goal."""
+    turns = course.turns_ahead(laps)
+    at = np.array([t.distance for t in turns] + [course.lap_end(laps) or course.start_distance])
+    if course.closed:
+        at = at % course.length
+    x, y = (np.interp(at, course.marks, course.line[:, i]) for i in (0, 1))
+    return Lane(x, y, course.start[2] + np.cumsum([0.0] + [t.angle for t in turns]))
 
 
 @pytree
@@ -37,7 +65,8 @@ class Straighten:
     steering = -(p offset + i integral + d angle), the angle to the corridor standing for the
     offset's rate. Offset and angle are those of the wall filter (`by` "filter"); or, as the paper
     had it (`by` "sonar"), the offset comes from the side sonars, each by itself while it sees a
-    wall of the corridor, and the angle from the gyroscope alone.
+    wall of the corridor, and the angle from the gyroscope alone. With `by` "pose" both are those of
+    the estimate's pose in `lane`, for a car whose pose on the course is known.
     """
 
     speed: Scalar  # m/s
@@ -46,6 +75,7 @@ class Straighten:
     hold: Scalar  # throttle per speed that holds it, s/m
     dead_zone: Scalar
     limit: Scalar  # of steering, rad
+    lane: Lane
     by: str = dataclasses.field(default="filter", metadata={"static": True})
     p: Scalar = 1.2  # rad/m
     i: Scalar = 0.3  # rad/(m s)
@@ -78,8 +108,13 @@ class Straighten:
         walls: Any = ()
         if self.by == "filter":
             ages = tuple(heard.age for heard in seen.sonar)
-            walls = self.walls.update(memory.walls, seen.sonar, ages, seen.estimate, seen.time)
+            scan = () if seen.lidar is None else (seen.lidar, seen.lidar.age)
+            walls = self.walls.update(
+                memory.walls, seen.sonar, ages, seen.estimate, seen.time, *scan
+            )
             offset, error = walls.offset, walls.angle
+        elif self.by == "pose":
+            offset, error, _ = self.lane.place(memory.turned, seen.estimate)
         else:
             error = memory.error + seen.estimate.heading - memory.heading
             offset = self._heard(memory.offset, error, seen, dt)
@@ -91,6 +126,7 @@ class Straighten:
             seen.time,
             walls,
             memory.command,
+            memory.turned,
         )
 
     def _heard(self, offset: Scalar, error: Scalar, seen: Observation, dt: Scalar) -> Scalar:
@@ -113,7 +149,11 @@ class Straighten:
         if self.by == "filter":
             walls = self.walls.turned(walls, angle, DOUBT)
         beyond = memory._replace(
-            offset=0.0 * memory.offset, error=memory.error - angle, integral=0.0, walls=walls
+            offset=0.0 * memory.offset,
+            error=memory.error - angle,
+            integral=0.0,
+            walls=walls,
+            turned=memory.turned + 1,
         )
         return jax.tree.map(lambda new, old: jnp.where(now, new, old), beyond, memory)
 
@@ -128,7 +168,7 @@ class Straighten:
 
 
 def straighten(
-    course: Course, car: Car, speed: float | None = None, by: str = "filter"
+    course: Course, car: Car, speed: float | None = None, by: str = "filter", laps: int = 1
 ) -> Straighten:
     """For a course and a nominal car; `speed` in m/s."""
     speed = SPEED if speed is None else speed
@@ -140,6 +180,7 @@ def straighten(
         hold=holding_throttle(car, speed) / max(speed, 0.1),
         dead_zone=car.motor.dead_zone,
         limit=min(float(car.servo.limit_left), float(car.servo.limit_right)),
+        lane=lane(course, laps),
         by=by,
     )
 

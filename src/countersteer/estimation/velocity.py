@@ -5,8 +5,12 @@ the tyres do, so a drift needs no tyre model. Its bias would let sideways speed 
 seconds; while the tyres hold, the rear axle hardly moves sideways and the encoder's wheel rolls,
 and both say so. Between readings, and where a sensor has died or is stuck, the nominal car's single
 track goes on. Friction is felt where the rear axle slides, the battery under the motor's current.
+
+A car whose place is told from outside (`sensors.position`) has its place among the states; what is
+told is of an instant before, by the sensor's delay, and is compared with where the car was then.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -27,12 +31,14 @@ from countersteer.world.chassis import Symmetric, Vector
 from countersteer.world.planar import Command, rotated
 
 # What the nominal car's declaration does not tell: how far the real one may be from it.
-GYRO_BIAS = 0.01  # rad/s, standard deviation
-ACCEL_BIAS = 0.1  # m/s²
+GYRO_BIAS = 0.005  # rad/s, standard deviation
+ACCEL_BIAS = 0.06  # m/s²
 WANDER = 0.001  # of the gyroscope's bias, rad/s per root second
 START = 0.02  # heading at the start, rad
 JERK = 1.5  # by which the yaw rate changes, rad/s per root second
-HOLDS = 0.013  # m/s: how well a wheel that holds is known to roll, and an axle not to slide
+HOLDS = 0.0088  # m/s: how well a wheel that holds is known to roll,
+KEEPS = 0.0045  # m/s: and an axle that holds not to slide
+CREEPS = 0.2  # part by which the rear axle's creep is not what its tyre's stiffness makes of it
 MEMORY = 0.2  # s for which that error stays the same
 SLIDES = 1.5  # m/s: the same where the axle slides
 ADHERES = 0.12  # rad of slip angle up to which an axle holds
@@ -40,6 +46,12 @@ USED = 0.6  # part of the nominal friction up to which it does
 SMOOTH = 0.03  # s over which accelerations are looked at
 LATE = 2.5  # periods of a sensor after which its last reading tells nothing
 REPEATS = 20  # equal readings after which a sensor counts as stuck
+SWING = 60.0  # rad/s² of yaw acceleration, and
+JOLT = (
+    500.0  # m/s³ of jerk, that no car makes: readings that differ by more have a spike among them
+)
+STEADY = 4  # readings in a row without, after such a one, until they are believed again
+LEAP = 6.0  # standard deviations of noise by which readings may differ beside that
 BLIND = 2.0  # m/s²: error of the single track's acceleration
 BLIND_RATE = 1.0  # rad/s: of its yaw rate
 FRICTION = 0.1  # deviation of the friction scale at the start
@@ -50,7 +62,10 @@ UNSURE = 3.0  # m/s per root second, by which it then is
 GATE = 4.0  # standard deviations beyond which a reading is not believed
 GYRO_GATE = 6.0  # the same of the gyroscope: a yaw rate changes by jerks
 
-VX, VY, RATE, HEADING, GYRO, AX, AY, ROLLED = range(8)
+STRAYS = 0.01  # m per root second, by which the place errs beside what the velocity's error makes
+PLACE = 0.1  # m, of the place at the start
+
+VX, VY, RATE, HEADING, GYRO, AX, AY, ROLLED, X, Y = range(10)  # the last two: where it is told
 
 
 class Sense(NamedTuple):
@@ -59,6 +74,7 @@ class Sense(NamedTuple):
     value: Scalar
     tick: Scalar
     repeats: Scalar  # readings in a row that were equal
+    steady: Scalar  # and that followed the one before, as what they measure cannot leap
 
 
 class Memory(NamedTuple):
@@ -68,7 +84,7 @@ class Memory(NamedTuple):
     those of `settled`, and `ahead` goes on from there.
     """
 
-    mean: tuple[Scalar, ...]  # vx, vy, yaw rate, heading, biases (gyro, accel x, y), rolled
+    mean: tuple[Scalar, ...]  # vx, vy, yaw rate, heading, biases (gyro, accel x, y), rolled(, x, y)
     covariance: Covariance
     tick: Scalar
     settled: Scalar  # tick of the accelerometer's last reading
@@ -84,9 +100,11 @@ class Memory(NamedTuple):
     pack: Pack
     actuators: Actuators
     gyroscope: Sense
-    accelerometer: Sense
+    accelerometer: Sense  # forward,
+    sideways: Sense  # and to the left
     encoder: Sense
     voltmeter: Sense
+    position: Sense | None  # None: the car has no such sensor
     lost: Scalar  # reports of the encoder in a row that were not believed
 
 
@@ -95,10 +113,23 @@ def initial_memory(car: Car, pose: tuple[float, float, float], dtype: np.dtype) 
     gyro, accel = car.sensors.gyroscope, car.sensors.accelerometer
     x, y, heading = (jnp.asarray(value, dtype) for value in pose)
     zero, one, none = dtype.type(0), dtype.type(1), np.int32(0)
-    spread = (0.1, 0.05, 0.05, START, GYRO_BIAS, ACCEL_BIAS, ACCEL_BIAS, 0.01)
-    quiet = Sense(zero, none, none)
+    spread: tuple[float, ...] = (0.1, 0.05, 0.05, START, GYRO_BIAS, ACCEL_BIAS, ACCEL_BIAS, 0.01)
+    quiet = Sense(zero, none, none, np.int32(STEADY))
+    mean: tuple[Scalar, ...] = (
+        zero,
+        zero,
+        zero,
+        heading,
+        gyro.bias,
+        accel.bias_x,
+        accel.bias_y,
+        zero,
+    )
+    told = car.sensors.position.reports != "none"
+    if told:
+        mean, spread = (*mean, x, y), (*spread, PLACE, PLACE)
     memory = Memory(
-        (zero, zero, zero, heading, gyro.bias, accel.bias_x, accel.bias_y, zero),
+        mean,
         kalman.diagonal([one * s for s in spread]),
         tick=none,
         settled=none,
@@ -115,8 +146,10 @@ def initial_memory(car: Car, pose: tuple[float, float, float], dtype: np.dtype) 
         actuators=Actuators(zero, zero),
         gyroscope=quiet,
         accelerometer=quiet,
+        sideways=quiet,
         encoder=quiet,
         voltmeter=quiet,
+        position=quiet if told else None,
         lost=none,
     )
     return typed(memory, dtype)
@@ -134,18 +167,27 @@ def typed(memory: Memory, dtype: np.dtype) -> Memory:
 
 
 def heard(
-    sense: Sense, reading: Reading, rate: Scalar, tick: Scalar, dt: float
+    sense: Sense,
+    reading: Reading,
+    rate: Scalar,
+    tick: Scalar,
+    dt: float,
+    leap: Scalar = math.inf,
 ) -> tuple[Sense, Scalar, Scalar]:
     """A sensor with what it last said, whether that is new, and whether it is to be believed.
 
-    It is not where it is late by more than its rate allows, stuck, or no number.
+    It is not where it is late by more than its rate allows, stuck, no number, or leaping: spikes in
+    a row that happen to lie near what is expected would else be believed one after another.
     """
     fresh = reading.tick > sense.tick
     same = reading.value == sense.value
     repeats = jnp.where(fresh, jnp.where(same, sense.repeats + 1, 0), sense.repeats)
+    follows = jnp.abs(reading.value - sense.value) <= leap
+    steady = jnp.where(fresh, jnp.where(follows, sense.steady + 1, 0), sense.steady)
     timely = (tick - reading.tick) * dt * rate < LATE
     sound = timely & (reading.tick > 0) & (repeats < REPEATS) & jnp.isfinite(reading.value)
-    return Sense(reading.value, jnp.maximum(reading.tick, sense.tick), repeats), fresh, sound
+    sense = Sense(reading.value, jnp.maximum(reading.tick, sense.tick), repeats, steady)
+    return sense, fresh, sound & (steady >= STEADY)
 
 
 def update(
@@ -159,10 +201,22 @@ def update(
     mean, covariance = memory.mean, memory.covariance
     dtype = jnp.result_type(mean[VX])
     gyro, accel = sensors.gyroscope, sensors.accelerometer
-    gyroscope, turned, gyro_sound = heard(memory.gyroscope, readings.gyroscope, gyro.rate, tick, dt)
-    accelerometer, weighed, accel_sound = heard(
-        memory.accelerometer, readings.accel_x, accel.rate, tick, dt
+    gyroscope, turned, gyro_sound = heard(
+        memory.gyroscope,
+        readings.gyroscope,
+        gyro.rate,
+        tick,
+        dt,
+        SWING / gyro.rate + LEAP * gyro.noise,
     )
+    jolt = JOLT / accel.rate + LEAP * accel.noise
+    accelerometer, weighed, accel_sound = heard(
+        memory.accelerometer, readings.accel_x, accel.rate, tick, dt, jolt
+    )
+    sideways, _, sideways_sound = heard(
+        memory.sideways, readings.accel_y, accel.rate, tick, dt, jolt
+    )
+    accel_sound = accel_sound & sideways_sound
     encoder, counted, _ = heard(
         memory.encoder, readings.counts, 1 / sensors.encoder.update, tick, dt
     )
@@ -225,12 +279,12 @@ def update(
     yaw_acceleration = memory.yaw_acceleration + blend * (turning - memory.yaw_acceleration)
 
     # The velocity goes on to the accelerometer's reading; without one, as the single track does.
-    measured = weighed & accel_sound & jnp.isfinite(readings.accel_y.value)
+    measured = weighed & accel_sound
     blind = ~measured & (seconds(tick - memory.settled) * accel.rate > LATE)
     settled = jnp.where(measured, accelerometer.tick, jnp.where(blind, tick, memory.settled))
     h_settled = seconds(settled - memory.settled)
     per = 1 / jnp.maximum(h_settled, 1e-6)
-    vx, vy, _, _, _, bias_x, bias_y, rolled = mean
+    vx, vy, _, _, _, bias_x, bias_y, rolled, *place = mean
     turn = jnp.where(h_settled > 0, heading - memory.settled_heading, 0.0)
     forward = jnp.where(measured, readings.accel_x.value - bias_x, (ahead.x - vx) * per - rate * vy)
     left = jnp.where(measured, readings.accel_y.value - bias_y, (ahead.y - vy) * per + rate * vx)
@@ -259,14 +313,29 @@ def update(
     # A wheel that keeps rolling otherwise than it should: then it is the speed that is wrong.
     astray = jnp.where(memory.lost >= LOST, UNSURE**2 * h_settled, 0.0)
     in_play = jnp.where(measured, h_settled, 0.0)
+    cosine, sine = cosine_sine(heading)
+    onward = Vector(cosine * vx - sine * vy, sine * vx + cosine * vy, rate)  # in the world's axes
+    moves: dict[int, kalman.Row] = {}
+    if place:
+        moves = {
+            X: {VX: h_settled * cosine, VY: -h_settled * sine, HEADING: -h_settled * onward.y},
+            Y: {VX: h_settled * sine, VY: h_settled * cosine, HEADING: h_settled * onward.x},
+        }
+        place = [place[0] + h_settled * onward.x, place[1] + h_settled * onward.y]
     covariance = predict(
         covariance,
         {
             VX: {VY: turn, RATE: h_settled * vy, AX: -in_play},
             VY: {VX: -turn, RATE: -h_settled * vx, AY: -in_play},
             ROLLED: {VX: h_settled * stretch, RATE: -h_settled * arm},
+            **moves,
         },
-        {VX: shaken + astray, VY: shaken, ROLLED: known},
+        {
+            VX: shaken + astray,
+            VY: shaken,
+            ROLLED: known,
+            **dict.fromkeys(moves, STRAYS**2 * h_settled),
+        },
     )
     # Half the turn before the push and half after it: a free velocity keeps its length.
     halfway = rotated(Vector(vx, vy, rate), turn / 2)
@@ -281,7 +350,7 @@ def update(
     backwards = jnp.where(after.x < 0, -1.0, 1.0)
     late = jnp.where(counted, seconds(settled - encoder.tick), 0.0)
     rolled = rolled - backwards * passed * region
-    mean = (after.x, after.y, rate, heading, mean[GYRO], bias_x, bias_y, rolled)
+    mean = (after.x, after.y, rate, heading, mean[GYRO], bias_x, bias_y, rolled, *place)
     mean, covariance, taken = correct(
         mean,
         covariance,
@@ -293,7 +362,8 @@ def update(
     )
     # After a slide or a lost report it begins anew within its region.
     failed = counted & ~taken
-    mean = (*mean[:ROLLED], jnp.where(failed, backwards * region / 2, mean[ROLLED]))
+    anew = jnp.where(failed, backwards * region / 2, mean[ROLLED])
+    mean = (*mean[:ROLLED], anew, *mean[ROLLED + 1 :])
     covariance = kalman.renewed(covariance, ROLLED, region**2 / 12, failed)
     lost = jnp.where(counted, jnp.where(taken | (passed == 0), 0, memory.lost + 1), memory.lost)
 
@@ -304,10 +374,39 @@ def update(
         covariance,
         {VY: 1.0, RATE: -behind},
         creep - (mean[VY] - behind * mean[RATE]),
-        (HOLDS + 0.5 * jnp.abs(creep)) ** 2 * 2 * MEMORY * per,
+        (KEEPS + CREEPS * jnp.abs(creep)) ** 2 * 2 * MEMORY * per,
         holds & (h_settled > 0),
         GATE,
     )
+
+    # Where the car was, as told from outside.
+    position = memory.position
+    told_x, told_y = readings.position_x, readings.position_y
+    if position is not None and told_x is not None and told_y is not None:
+        part = sensors.position
+        position, placed, told = heard(position, told_x, part.rate, tick, dt)
+        late = seconds(settled - position.tick) + part.delay
+        for state, reading, row in (
+            (X, told_x, {VX: -late * cosine, VY: late * sine}),
+            (Y, told_y, {VX: -late * sine, VY: -late * cosine}),
+        ):
+            then = mean[state] + sum(slope * mean[i] for i, slope in row.items())
+            mean, covariance, _ = correct(
+                mean,
+                covariance,
+                {state: 1.0, **row},
+                reading.value - then,
+                part.noise**2 + 1e-8,
+                placed & told & jnp.isfinite(reading.value),
+                GATE,
+            )
+        if readings.position_heading is not None:
+            late = seconds(tick - position.tick) + part.delay
+            off = readings.position_heading.value - (mean[HEADING] - late * mean[RATE])
+            off = off - 2 * jnp.pi * jnp.round(off / (2 * jnp.pi))
+            row = {HEADING: 1.0, RATE: -late}
+            noise = part.heading_noise**2 + 1e-8
+            mean, covariance, _ = correct(mean, covariance, row, off, noise, placed & told, GATE)
 
     # Where the rear axle slides, its pull is its friction, against the slip.
     slip_y = mean[VY] - behind * mean[RATE]
@@ -333,6 +432,10 @@ def update(
         jnp.where(stands, mean[VX], ahead.x), jnp.where(stands, mean[VY], ahead.y), mean[RATE]
     )
     cosine, sine = cosine_sine(mean[HEADING])
+    since = h
+    x, y = memory.x, memory.y
+    if place:
+        since, x, y = seconds(tick - settled), mean[X], mean[Y]
     return typed(
         Memory(
             mean,
@@ -341,8 +444,8 @@ def update(
             settled,
             jnp.where(stands, mean[HEADING], memory.settled_heading),
             ahead,
-            memory.x + h * (cosine * ahead.x - sine * ahead.y),
-            memory.y + h * (sine * ahead.x + cosine * ahead.y),
+            x + since * (cosine * ahead.x - sine * ahead.y),
+            y + since * (sine * ahead.x + cosine * ahead.y),
             accel_x,
             accel_y,
             yaw_acceleration,
@@ -352,8 +455,10 @@ def update(
             actuators,
             gyroscope,
             accelerometer,
+            sideways,
             encoder,
             voltmeter,
+            position,
             lost,
         ),
         dtype,
@@ -366,6 +471,10 @@ def estimate(car: Car, memory: Memory, dt: float) -> Estimate:
     dtype = jnp.result_type(mean[VX])
     astray = BLIND**2 * SMOOTH * ((memory.tick - memory.settled) * dt).astype(dtype)
     voltage, resistance = memory.pack.mean
+    pose = Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if len(mean) > X:
+        at = ((X, X), (Y, Y), (HEADING, HEADING), (X, Y), (X, HEADING), (Y, HEADING))
+        pose = Symmetric(*(entry(p, i, j) for i, j in at))
     return Estimate(
         memory.x,
         memory.y,
@@ -386,4 +495,5 @@ def estimate(car: Car, memory: Memory, dt: float) -> Estimate:
             entry(p, VX, RATE),
             entry(p, VY, RATE),
         ),
+        pose,
     )

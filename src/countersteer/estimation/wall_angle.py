@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.car import Car
+from countersteer.car.car import Car, Lidar
 from countersteer.car.parameter import Scalar, pytree
+from countersteer.estimation import lidar_walls
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.kalman import Covariance, correct, diagonal, entry, predict
 from countersteer.sensing.suite import Reading
@@ -26,6 +27,7 @@ START = (0.1, 0.05, 0.005)  # standard deviations at the start: m, rad, rad/s
 WALKS = (0.02, 0.02, 0.001)  # growth of them, per root second
 TURNING = 1.0  # rad/s of yaw rate from which on no wall is looked at: it may be a corner's
 STEEPEST = math.radians(20)  # angle to a wall beyond which it is not looked at
+SCANNED = math.radians(35)  # the same of a lidar's beams
 NEAREST = 0.08  # m from a wall within which no car's middle can be
 COARSE = 0.05  # m: error that a reading is credited with while the offset is hardly known
 REPEATS = 16  # equal readings after which a sonar counts as stuck
@@ -81,6 +83,7 @@ class WallAngle:
     resolution: Scalar
     mounts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     sides: tuple[float, ...] = dataclasses.field(metadata={"static": True})
+    lidar: Lidar | None = None  # where the car has one, its beams tell too
 
     def initial_memory(
         self,
@@ -114,6 +117,8 @@ class WallAngle:
         ages: tuple[Scalar, ...],
         estimate: Estimate,
         time: Scalar,
+        scan: Reading | Any | None = None,
+        scan_age: Scalar = math.inf,
     ) -> Memory:
         """With what the sonars have that is new: those readings whose age (s) is under a step's.
 
@@ -163,6 +168,17 @@ class WallAngle:
                 GATE,
             )
             believed = jnp.where(taken, time, believed)
+        if self.lidar is not None and scan is not None:
+            mean, covariance, taken = lidar_walls.line_up(
+                self.lidar,
+                self.width,
+                mean,
+                covariance,
+                scan.value,
+                (scan_age < h - ROUNDING) & (jnp.abs(mean[ANGLE]) < SCANNED),
+                GATE,
+            )
+            believed = jnp.where(taken, time, believed)
         # Long without a believed reading: rather believe too little than shut them all out.
         lost = jnp.where(time - believed > FORGETS, (0.3 * self.width) ** 2 * h, 0.0)
         covariance = predict(covariance, {}, {OFFSET: lost})
@@ -187,4 +203,5 @@ def wall_angle(car: Car, width: float) -> WallAngle:
         resolution=sonar.resolution,
         mounts=tuple(number for number, _, _ in found),
         sides=tuple(side for _, side, _ in found),
+        lidar=car.sensors.lidar if car.sensors.lidar.beams else None,
     )

@@ -14,8 +14,9 @@ from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.evaluation.population import Population, draw
-from countersteer.evaluation.rollout import REACHED, STATUS, Score, rollouts
+from countersteer.evaluation.rollout import LANES, REACHED, STATUS, Score, Watch, watched
 from countersteer.link.link import Link
+from countersteer.sensing.faults import Fault
 from countersteer.simulator import Simulator
 
 DRIFT = math.radians(25)  # sideslip that makes a turn a drift
@@ -45,6 +46,17 @@ class Trials:
         report: Callable[[int, int], None] = lambda *_: None,
     ) -> Score:
         """All trials of one driver, in 32 bits; `make` makes it for a speed."""
+        return self.watched(make, None, report)[0]
+
+    def watched(
+        self,
+        make: Callable[[float | None], Driver],
+        watch: Watch | None,
+        report: Callable[[int, int], None] = lambda *_: None,
+        faults: tuple[Fault, ...] = (),
+        lanes: int = LANES,
+    ) -> tuple[Score, Any]:
+        """The same with what `watch` has kept, and with sensors that fail as each trial's do."""
         drawn = draw(self.population, self.car, self.course, self.seeds, np.float32, self.speeds)
         if drawn.speed is None:
             drivers = [make(None)] * len(self.seeds)
@@ -54,7 +66,18 @@ class Trials:
         car = jax.tree.map(np.float32, self.car)
         simulator = Simulator(self.course, car, drivers[0], self.link, self.estimate, self.dt)
         longest = 3.0 + (self.course.lap_end(self.laps) or 0.0) / SLOWEST
-        return rollouts(simulator, drawn, drivers, self.seeds, self.laps, longest, report)
+        return watched(
+            simulator,
+            drawn,
+            drivers,
+            self.seeds,
+            self.laps,
+            longest,
+            watch,
+            report,
+            lanes,
+            faults,
+        )
 
     def about(self) -> dict[str, Any]:
         """What a record says of the trials."""

@@ -9,7 +9,7 @@ What is judged, and when, is as `turns` judges a recorded drive (a test holds th
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from countersteer.evaluation.turns import (
     Judge,
 )
 from countersteer.sensing import sonar
+from countersteer.sensing.faults import Fault
 from countersteer.simulator import Loop, Plan, Simulator, Surroundings, begin, padded, tick
 from countersteer.world import planar
 from countersteer.world.floor import Floor
@@ -169,6 +170,7 @@ class Trials(NamedTuple):
     pose: Array  # (n, 3)
     floor: Floor | None
     seed: Array
+    faults: tuple[Fault, ...] = ()  # starts and durations are each trial's
 
 
 class Shared(NamedTuple):
@@ -181,17 +183,37 @@ class Shared(NamedTuple):
     start: tuple[Scalar, Scalar, Scalar]  # the one that the driver believes
     way: Way
     score: Score  # before the first sample
+    watch: Any = None
+
+
+class Watch(Protocol):
+    """What looks on at trials beside the judge, in pytrees; a pytree itself, all trials share it.
+
+    What it keeps of a trial is looked at every `LOOK`, before the judge's sample is taken.
+    """
+
+    def begin(self, around: Surroundings, loop: Loop) -> Any:
+        """What is kept before the first tick."""
+        ...
+
+    def look(self, plan: Plan, around: Surroundings, loop: Loop, score: Score, kept: Any) -> Any:
+        """What is kept with this instant; of no effect when the trial is over."""
+        ...
+
+    def end(self, kept: Any) -> Any:
+        """What is given of it, as arrays."""
+        ...
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _rollout(
     mesh: Mesh, plan: Plan, ticks: int, shared: Shared, varied: Trials, driver: Any
-) -> Score:
+) -> tuple[Score, Any]:
     """A block of trials on each core; `driver` holds None where the trials' drivers differ."""
     cut, same = PartitionSpec("core"), PartitionSpec()
 
-    def on_core(shared: Shared, varied: Trials, driver: Any) -> Score:
-        def one(own: Trials) -> Score:
+    def on_core(shared: Shared, varied: Trials, driver: Any) -> tuple[Score, Any]:
+        def one(own: Trials) -> tuple[Score, Any]:
             mine = jax.tree.map(
                 lambda a, b: b if a is None else a, driver, own.driver, is_leaf=lambda x: x is None
             )
@@ -205,11 +227,12 @@ def _rollout(
     return run(shared, varied, driver)
 
 
-def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> Score:
+def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> tuple[Score, Any]:
     """One trial of at most so many ticks; a block goes on until all its trials are over."""
     every = max(1, round(LOOK / plan.dt))
     key, driver_key = jax.random.split(jax.random.key(own.seed))
-    around = Surroundings(shared.walls, shared.corners, key, shared.loss, shared.nominal, own.floor)
+    known = (shared.loss, shared.nominal, own.floor, own.faults)
+    around = Surroundings(shared.walls, shared.corners, key, *known)
     zero = jnp.zeros_like(own.charge)
     pose = (own.pose[0], own.pose[1], own.pose[2])
     still = (zero, zero, zero)
@@ -228,22 +251,92 @@ def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> Score:
     def one(loop: Loop, _: None) -> tuple[Loop, None]:
         return tick(plan, own.car, around, own.driver, loop)[0], None
 
-    def look(carry: tuple[Loop, Score, Scalar]) -> tuple[Loop, Score, Scalar]:
-        loop, score, _ = carry
+    watch = shared.watch
+    kept = () if watch is None else watch.begin(around, loop)
+
+    def look(carry: tuple[Loop, Score, Scalar, Any]) -> tuple[Loop, Score, Scalar, Any]:
+        loop, score, _, kept = carry
+        if watch is not None:
+            told = watch.look(plan, around, loop, score, kept)
+            live = score.status == DRIVING
+            kept = jax.tree.map(lambda new, old: jnp.where(live, new, old), told, kept)
         time = plan.dt * loop.tick.astype(score.distance.dtype)
         turn = jnp.asarray(getattr(loop.memory, "turn", 0))
         score = follow(shared.way, score, loop.state, turn, time)
         loop, _ = jax.lax.scan(one, loop, None, length=every)
         # Common to the block, so that the loop's end is.
         going = jax.lax.pmax((score.status == DRIVING).astype(jnp.int32), "trial")
-        return loop, score, going
+        return loop, score, going, kept
 
-    def goes_on(carry: tuple[Loop, Score, Scalar]) -> Any:
+    def goes_on(carry: tuple[Loop, Score, Scalar, Any]) -> Any:
         return (carry[2] > 0) & (carry[0].tick <= ticks)
 
-    loop, score, _ = jax.lax.while_loop(goes_on, look, (loop, shared.score, jnp.int32(1)))
+    first = (loop, shared.score, jnp.int32(1), kept)
+    loop, score, _, kept = jax.lax.while_loop(goes_on, look, first)
     late = score.status == DRIVING
-    return score._replace(status=jnp.where(late, jnp.int32(LATE), score.status))
+    return score._replace(status=jnp.where(late, jnp.int32(LATE), score.status)), (
+        () if watch is None else watch.end(kept)
+    )
+
+
+def watched(
+    simulator: Simulator,
+    drawn: Drawn,
+    drivers: Sequence[Driver],
+    seeds: Sequence[int],
+    laps: int,
+    longest: float,
+    watch: Watch | None,
+    report: Callable[[int, int], None] = lambda *_: None,
+    lanes: int | None = None,
+    faults: tuple[Fault, ...] = (),
+) -> tuple[Score, Any]:
+    """One trial for each seed, its driver and what was drawn for it; and what `watch` has kept.
+
+    `simulator` says how: course, link, step, estimate; its car is the nominal one. In the precision
+    of the leaves of `drawn`. Leaves of `faults` and of the result have an axis of trials in front.
+    """
+    course = simulator.course
+    if course is None or course.goal_distance is None:
+        raise InputError("trials need a course with a goal")
+    dtype = np.asarray(drawn.charge).dtype
+    slots = planar.delay_slots(drawn.cars, simulator.dt)
+    plan = simulator.plan()._replace(slots=slots, fails=bool(faults))
+    walls = padded(course.walls, dtype)
+    way = way_of(course, laps, dtype)
+    start = initial_score(course, len(way.bearings), dtype.type)
+    shared = Shared(
+        walls,
+        sonar.edges(walls),
+        dtype.type(simulator.link.loss),
+        jax.tree.map(dtype.type, simulator.nominal or simulator.car),
+        tuple(map(dtype.type, course.start)),
+        way,
+        start,
+        watch,
+    )
+    common, own = _common(drivers, dtype)
+    varied = Trials(
+        drawn.cars,
+        own,
+        drawn.charge,
+        drawn.pose,
+        drawn.floor,
+        np.asarray(seeds, np.int32),
+        jax.tree.map(dtype.type, faults),
+    )
+    mesh = Mesh(np.array(jax.devices()), ("core",))
+    ticks, count = round(longest / simulator.dt), len(seeds)
+    width = (lanes or (FEW if count <= FEW * mesh.size else LANES)) * mesh.size
+    found = []
+    for first in range(0, count, width):
+        picked = np.arange(first, first + width) % count
+        with jax.enable_x64(dtype == np.float64):
+            results = _rollout(mesh, plan, ticks, shared, _rows(varied, picked), common)
+        found.append(_rows(results, np.arange(min(width, count - first))))
+        report(min(first + width, count), count)
+    whole: tuple[Score, Any] = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    return whole
 
 
 def rollouts(
@@ -256,60 +349,8 @@ def rollouts(
     report: Callable[[int, int], None] = lambda *_: None,
     lanes: int | None = None,
 ) -> Score:
-    """One trial for each seed, its driver and what was drawn for it.
-
-    `simulator` says how: course, link, step, estimate; its car is the nominal one. In the precision
-    of the leaves of `drawn`. Leaves of the result have an axis of trials in front.
-    """
-    if simulator.course is None or simulator.course.goal_distance is None:
-        raise InputError("trials need a course with a goal")
-    dtype = np.asarray(drawn.charge).dtype
-    with jax.enable_x64(dtype == np.float64):
-        return _rollouts(
-            simulator, simulator.course, drawn, drivers, seeds, laps, longest, report, lanes
-        )
-
-
-def _rollouts(
-    simulator: Simulator,
-    course: Course,
-    drawn: Drawn,
-    drivers: Sequence[Driver],
-    seeds: Sequence[int],
-    laps: int,
-    longest: float,
-    report: Callable[[int, int], None],
-    lanes: int | None,
-) -> Score:
-    """In the precision that is set."""
-    dtype = np.asarray(drawn.charge).dtype
-    plan = simulator.plan()._replace(slots=planar.delay_slots(drawn.cars, simulator.dt))
-    walls = padded(course.walls, dtype)
-    way = way_of(course, laps, dtype)
-    start = initial_score(course, len(way.bearings), dtype.type)
-    shared = Shared(
-        walls,
-        sonar.edges(walls),
-        dtype.type(simulator.link.loss),
-        jax.tree.map(dtype.type, simulator.nominal or simulator.car),
-        tuple(map(dtype.type, course.start)),
-        way,
-        start,
-    )
-    common, own = _common(drivers, dtype)
-    varied = Trials(
-        drawn.cars, own, drawn.charge, drawn.pose, drawn.floor, np.asarray(seeds, np.int32)
-    )
-    mesh = Mesh(np.array(jax.devices()), ("core",))
-    ticks, count = round(longest / simulator.dt), len(seeds)
-    width = (lanes or (FEW if count <= FEW * mesh.size else LANES)) * mesh.size
-    scores = []
-    for first in range(0, count, width):
-        picked = np.arange(first, first + width) % count
-        score = _rollout(mesh, plan, ticks, shared, _rows(varied, picked), common)
-        scores.append(_rows(score, np.arange(min(width, count - first))))
-        report(min(first + width, count), count)
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *scores)
+    """`watched` with nobody looking on."""
+    return watched(simulator, drawn, drivers, seeds, laps, longest, None, report, lanes)[0]
 
 
 def _rows(tree: Any, picked: np.ndarray) -> Any:

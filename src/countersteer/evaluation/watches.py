@@ -1,0 +1,255 @@
+"""What is looked at beside the judge while trials run: errors of the estimates, and the pose.
+
+Each is a `rollout.Watch`. Sums are kept, not records, so that thousands of trials fit.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.course.course import Course
+from countersteer.drivers.drift_turn import STRAIGHT
+from countersteer.drivers.straighten import Lane
+from countersteer.estimation import dead_reckoning, pose, spikes
+from countersteer.estimation.estimate import Estimate
+from countersteer.evaluation.rollout import LOOK, Score
+from countersteer.simulator import LOCATING, Loop, Plan, Surroundings, observe
+from countersteer.world.chassis import Vector, dot, solve
+
+SLIPS = math.radians(10)  # sideslip from which on the car drifts
+FASTER = 0.5  # m/s, below which sideslip means nothing
+WARM = 0.5  # s from the start that are not looked at
+SAMPLE, SAMPLES = 20, 240  # looks between two samples of the normalised error, and how many
+FIT = 0.05  # m within which a ping is of the wall that it should be of
+PARTICLES = 2000
+SETTLED = (0.3, math.radians(15))  # m and rad from the truth
+
+
+class Kept(NamedTuple):
+    """Sums over the looks at a trial, and what the next look needs."""
+
+    drifting: Scalar  # looks in drifts
+    slip: Scalar  # squared errors of the sideslip in them
+    reckoned: Scalar  # the same of dead reckoning
+    looks: Scalar
+    inside: Scalar  # of them within the 95 % of the covariance
+    alone: tuple[Scalar, ...]  # squared errors of vx, vy, yaw rate over each one's variance
+    squares: Array  # (SAMPLES,) normalised error squared of vx, vy, yaw rate; NaN: none
+    straight: Scalar  # looks on straights
+    offset_error: Scalar  # squared, of the driver's offset and angle to its corridor
+    angle_error: Scalar
+    offset_normal: Scalar  # squared over their variance
+    angle_normal: Scalar
+    offset: Scalar  # squared, of the car
+    angle: Scalar
+    pings: Scalar  # of the front sonar that are of the wall that it should be of
+    alarms: Scalar  # of these held for spikes by `spikes`
+    doubts: Scalar  # and by the driver
+    strays: Scalar  # that are not, and shorter
+    passed: Scalar  # of these believed by `spikes`
+    estimate: Estimate  # the last
+    charge: Scalar
+    reckoning: dead_reckoning.Memory
+    spike: spikes.Memory
+    sound: Scalar  # whether the ping at the last look was
+
+
+@pytree
+class Errors:
+    """Errors of what the driver is told, in a loop whose estimate is the velocity filter."""
+
+    lane: Lane
+    inside: Scalar  # 95 % of a chi-squared distribution with three degrees of freedom
+
+    def begin(self, around: Surroundings, loop: Loop) -> Kept:
+        """Nothing yet."""
+        del around
+        dtype = jnp.result_type(loop.state.motion.x)
+        zero, m = jnp.zeros((), dtype), loop.state.motion
+        told = jax.tree.map(lambda _: zero, Estimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        none: list[Any] = [zero] * len(Kept._fields)
+        return Kept(*none)._replace(
+            alone=(zero,) * 3,
+            squares=jnp.full(SAMPLES, jnp.nan, dtype),
+            estimate=told,
+            reckoning=dead_reckoning.initial_memory((m.x, m.y, m.heading), dtype),
+            spike=spikes.initial_memory(np.dtype(dtype)),
+        )
+
+    def look(self, plan: Plan, around: Surroundings, loop: Loop, score: Score, kept: Kept) -> Kept:
+        """One instant more."""
+        del score
+        motion = loop.state.motion
+        _, seen = observe(plan, around, loop)
+        told = jax.tree.map(lambda value: jnp.asarray(value, motion.charge.dtype), seen.estimate)
+        time = seen.time
+        warm = time > WARM
+
+        slip = jnp.arctan2(motion.vy, motion.vx)
+        fast = motion.vx**2 + motion.vy**2 > FASTER**2
+        drifts = jnp.where(warm & fast & (jnp.abs(slip) > SLIPS), 1.0, 0.0)
+        reckoning = dead_reckoning.update(kept.reckoning, loop.readings, plan.dt)
+
+        def square(other: Estimate) -> Scalar:
+            off = other.sideslip - slip
+            return jnp.arctan2(jnp.sin(off), jnp.cos(off)) ** 2
+
+        off = Vector(told.vx - motion.vx, told.vy - motion.vy, told.yaw_rate - motion.yaw_rate)
+        normal = dot(off, solve(told.velocity_covariance, off))
+        looked = jnp.where(warm, 1.0, 0.0)
+        number = loop.tick // round(LOOK / plan.dt)
+        place = jnp.minimum(number // SAMPLE, SAMPLES - 1)
+        fills = warm & (number % SAMPLE == 0)
+        squares = kept.squares.at[place].set(jnp.where(fills, normal, kept.squares[place]))
+
+        turn = jnp.asarray(getattr(loop.memory, "turn", 0))
+        own = getattr(loop.memory, "straight", loop.memory)
+        phase = getattr(loop.memory, "phase", STRAIGHT)
+        offset, angle, _ = self.lane.place(turn, motion)
+        straight = jnp.where(warm & (phase == STRAIGHT) & (jnp.abs(angle) < 0.3), 1.0, 0.0)
+        offset_error, angle_error = (own.offset - offset) ** 2, (own.error - angle) ** 2
+        variances = (jnp.inf, jnp.inf)
+        if own.walls != ():
+            variances = own.walls.offset_deviation**2, own.walls.angle_deviation**2
+
+        sonar, front = around.nominal.sensors.sonar, loop.readings.sonar[0]
+        expected = pose.PoseFilter(walls=around.walls, sonar=sonar).expected(
+            *(jnp.reshape(value, (1,)) for value in (motion.x, motion.y, motion.heading))
+        )[0][0]
+        came = (front.tick > kept.spike.tick) & jnp.isfinite(front.value) & warm
+        fits = jnp.abs(front.value - expected) < FIT
+        sound, stray = came & fits, came & (front.value < expected - FIT)
+        speed = jnp.sqrt(motion.vx**2 + motion.vy**2)
+        spike = spikes.update(kept.spike, front, LOOK * speed, sonar.noise)
+        held = spike.believed != front.value
+        # The driver has heard by now what came at the last look.
+        odd = getattr(loop.memory, "odds", 0) > 0
+        doubted = (kept.sound > 0) & odd & (phase == STRAIGHT)
+
+        one = lambda true: jnp.where(true, 1.0, 0.0)  # noqa: E731  # used five times
+        return Kept(
+            kept.drifting + drifts,
+            kept.slip + drifts * square(told),
+            kept.reckoned + drifts * square(reckoning.estimate),
+            kept.looks + looked,
+            kept.inside + looked * (normal < self.inside),
+            tuple(
+                sum_ + looked * error**2 / variance
+                for sum_, error, variance in zip(
+                    kept.alone, off, told.velocity_covariance[:3], strict=True
+                )
+            ),
+            squares,
+            kept.straight + straight,
+            kept.offset_error + straight * offset_error,
+            kept.angle_error + straight * angle_error,
+            kept.offset_normal + straight * offset_error / variances[0],
+            kept.angle_normal + straight * angle_error / variances[1],
+            kept.offset + straight * offset**2,
+            kept.angle + straight * angle**2,
+            kept.pings + one(sound),
+            kept.alarms + one(sound & held),
+            kept.doubts + one(doubted),
+            kept.strays + one(stray),
+            kept.passed + one(stray & ~held),
+            told,
+            motion.charge,
+            reckoning,
+            spike,
+            one(sound),
+        )
+
+    def end(self, kept: Kept) -> Kept:
+        """All of it."""
+        return kept
+
+
+class Placed(NamedTuple):
+    """How far the pose filter's best hypothesis is from each place that looks alike."""
+
+    distance: Array  # (places,) m, at the end of the second turn
+    angle: Array  # (places,) rad
+    share: Scalar  # of the weight
+    settled_at: Scalar  # s, from which on it never was off again; inf
+
+
+@pytree
+class Places:
+    """A pose filter that starts from anywhere on the course, beside the loop.
+
+    `turns` holds the angles by which the course can be turned about `middle` into itself.
+    """
+
+    place: pose.PoseFilter
+    uniform: tuple[Array, Array, Array]  # many x, y, headings, from which each trial draws its own
+    middle: Array  # (2,)
+    turns: Array  # (places,) rad
+    particles: int = dataclasses.field(default=PARTICLES, metadata={"static": True})
+
+    def begin(self, around: Surroundings, loop: Loop) -> tuple[pose.Memory, Placed]:
+        """Anywhere; each trial with noise of its own."""
+        zero = jnp.zeros_like(loop.state.motion.x)
+        still = Estimate(zero, zero, loop.state.motion.heading, zero, zero, zero)
+        key = jax.random.fold_in(around.key, 9)
+        none = jnp.full_like(self.turns, jnp.inf)
+        still = still._replace(heading=loop.estimate.mean[3])
+        picked = jax.random.randint(key, (self.particles,), 0, len(self.uniform[0]))
+        x, y, heading = (jnp.asarray(value)[picked] for value in self.uniform)
+        cloud = self.place.memory(x, y, heading, _slim(still), key)
+        return cloud, Placed(none, none, zero, zero + jnp.inf)
+
+    def look(
+        self,
+        plan: Plan,
+        around: Surroundings,
+        loop: Loop,
+        score: Score,
+        kept: tuple[pose.Memory, Placed],
+    ) -> tuple[pose.Memory, Placed]:
+        """One instant more: the cloud steps at its own period."""
+        every = round(LOCATING / plan.dt)
+
+        def step(kept: tuple[pose.Memory, Placed]) -> tuple[pose.Memory, Placed]:
+            cloud, placed = kept
+            _, seen = observe(plan, around, loop)
+            cloud = self.place.update(cloud, loop.readings.sonar, _slim(seen.estimate), LOCATING)
+            best = pose.best(cloud)
+            motion = loop.state.motion
+            cosine, sine = jnp.cos(self.turns), jnp.sin(self.turns)
+            dx, dy = motion.x - self.middle[0], motion.y - self.middle[1]
+            x = self.middle[0] + cosine * dx - sine * dy
+            y = self.middle[1] + sine * dx + cosine * dy
+            distance = jnp.hypot(best.x - x, best.y - y)
+            off = best.heading - motion.heading - self.turns
+            angle = jnp.abs(jnp.arctan2(jnp.sin(off), jnp.cos(off)))
+            good = jnp.any((distance < SETTLED[0]) & (angle < SETTLED[1]))
+            since = jnp.where(good, jnp.minimum(placed.settled_at, seen.time), jnp.inf)
+            open_yet = jnp.isinf(score.turns.end[1])
+            now = Placed(distance, angle, best.share, since)
+            return cloud, jax.tree.map(lambda a, b: jnp.where(open_yet, a, b), now, placed)
+
+        return jax.lax.cond(loop.tick % every == 0, step, lambda same: same, kept)
+
+    def end(self, kept: tuple[pose.Memory, Placed]) -> Placed:
+        """Without the cloud."""
+        return kept[1]
+
+
+def _slim(estimate: Estimate) -> Estimate:
+    """What the pose filter needs, all of one type."""
+    dtype = jnp.result_type(estimate.x)
+    slim = Estimate(*estimate[:6])._replace(velocity_covariance=estimate.velocity_covariance)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), slim)
+
+
+def anywhere(course: Course, place: pose.PoseFilter, count: int) -> tuple[Array, Array, Array]:
+    """Poses drawn evenly from the corridor, for `Places.uniform`."""
+    zero = jnp.zeros((), place.walls.dtype)
+    still = jax.tree.map(lambda _: zero, Estimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    cloud = place.uniform(course, jax.random.key(0), count, still)
+    return np.asarray(cloud.x), np.asarray(cloud.y), np.asarray(cloud.heading)
