@@ -226,6 +226,8 @@ def mujoco_side(size: Size) -> Iterator[dict[str, Any]]:
 
 def drive_side(size: Size) -> Iterator[dict[str, Any]]:
     """One car in the closed loop with its sensors and driver, in 64 bits."""
+    import jax
+
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.drivers.drift_turn import drift_turn
@@ -236,9 +238,29 @@ def drive_side(size: Size) -> Iterator[dict[str, Any]]:
     pieces = simulator.run(1e6)
     for _ in range(4):
         next(pieces)
+    act, memory, seen = thinking(simulator)
     yield {}
     while True:
-        yield {"drive_realtime_factor": rate(PIECE, lambda: next(pieces), size.least)}
+        yield {
+            "drive_realtime_factor": rate(PIECE, lambda: next(pieces), size.least),
+            "driver_act_s": 1 / rate(1, lambda: jax.block_until_ready(act(memory, seen)), 0.2),
+        }
+
+
+def thinking(simulator: Any) -> tuple[Any, Any, Any]:
+    """A driver's `act`, compiled, with a memory and an observation at which it thinks."""
+    import jax
+    import jax.numpy as jnp
+
+    from countersteer.simulator import jitted_observe
+
+    with jax.enable_x64(True):
+        plan = simulator.plan()
+        around, loop = simulator.begin(plan)
+        _, seen = jitted_observe(plan, around, loop)
+        seen = seen._replace(time=jnp.asarray(1.0))
+        act = jax.jit(simulator.driver.act).lower(loop.memory, seen).compile()
+        return act, *jax.tree.map(jnp.asarray, (loop.memory, seen))
 
 
 def native_side(size: Size) -> Iterator[dict[str, Any]]:
@@ -501,6 +523,7 @@ ROWS = (
     ("mujoco_steps_per_s", "MuJoCo, all cores", 1e6, "M steps/s"),
     ("mujoco_one_core_steps_per_s", "MuJoCo, one core", 1e6, "M steps/s"),
     ("drive_realtime_factor", "one drive in the closed loop", 1, "times real time"),
+    ("driver_act_s", "one thought of the drift-turn driver, called alone", 1e-3, "ms"),
     ("drive_warm_s", "`drive box`, whole process, warm", 1, "s"),
     ("drive_cold_s", "`drive box` with an empty cache", 1, "s"),
     ("peak_flops_per_s", "peak: chains of fused multiply-adds, f32, all cores", 1e9, "Gflop/s"),
