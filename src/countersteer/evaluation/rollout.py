@@ -183,6 +183,7 @@ class Shared(NamedTuple):
     start: tuple[Scalar, Scalar, Scalar]  # the one that the driver believes
     way: Way
     score: Score  # before the first sample
+    ticks: Scalar  # at most
     watch: Any = None
 
 
@@ -205,9 +206,9 @@ class Watch(Protocol):
         ...
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1))
 def _rollout(
-    mesh: Mesh, plan: Plan, ticks: int, shared: Shared, varied: Trials, driver: Any
+    mesh: Mesh, plan: Plan, shared: Shared, varied: Trials, driver: Any
 ) -> tuple[Score, Any]:
     """A block of trials on each core; `driver` holds None where the trials' drivers differ."""
     cut, same = PartitionSpec("core"), PartitionSpec()
@@ -217,7 +218,7 @@ def _rollout(
             mine = jax.tree.map(
                 lambda a, b: b if a is None else a, driver, own.driver, is_leaf=lambda x: x is None
             )
-            return _trial(plan, ticks, shared, own._replace(driver=mine))
+            return _trial(plan, shared, own._replace(driver=mine))
 
         return jax.vmap(one, axis_name="trial")(varied)
 
@@ -227,8 +228,8 @@ def _rollout(
     return run(shared, varied, driver)
 
 
-def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> tuple[Score, Any]:
-    """One trial of at most so many ticks; a block goes on until all its trials are over."""
+def _trial(plan: Plan, shared: Shared, own: Trials) -> tuple[Score, Any]:
+    """One trial; a block goes on until all its trials are over."""
     every = max(1, round(LOOK / plan.dt))
     key, driver_key = jax.random.split(jax.random.key(own.seed))
     known = (shared.loss, shared.nominal, own.floor, own.faults)
@@ -269,7 +270,7 @@ def _trial(plan: Plan, ticks: int, shared: Shared, own: Trials) -> tuple[Score, 
         return loop, score, going, kept
 
     def goes_on(carry: tuple[Loop, Score, Scalar, Any]) -> Any:
-        return (carry[2] > 0) & (carry[0].tick <= ticks)
+        return (carry[2] > 0) & (carry[0].tick <= shared.ticks)
 
     first = (loop, shared.score, jnp.int32(1), kept)
     loop, score, _, kept = jax.lax.while_loop(goes_on, look, first)
@@ -313,6 +314,7 @@ def watched(
         tuple(map(dtype.type, course.start)),
         way,
         start,
+        np.int32(round(longest / simulator.dt)),
         watch,
     )
     common, own = _common(drivers, dtype)
@@ -326,13 +328,13 @@ def watched(
         jax.tree.map(dtype.type, faults),
     )
     mesh = Mesh(np.array(jax.devices()), ("core",))
-    ticks, count = round(longest / simulator.dt), len(seeds)
+    count = len(seeds)
     width = (lanes or (FEW if count <= FEW * mesh.size else LANES)) * mesh.size
     found = []
     for first in range(0, count, width):
         picked = np.arange(first, first + width) % count
         with jax.enable_x64(dtype == np.float64):
-            results = _rollout(mesh, plan, ticks, shared, _rows(varied, picked), common)
+            results = _rollout(mesh, plan, shared, _rows(varied, picked), common)
         found.append(_rows(results, np.arange(min(width, count - first))))
         report(min(first + width, count), count)
     whole: tuple[Score, Any] = jax.tree.map(lambda *parts: np.concatenate(parts), *found)

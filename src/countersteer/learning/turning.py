@@ -1,0 +1,163 @@
+"""The numbers of a turn, learned by driving: a cross-entropy search over random cars.
+
+A generation of candidates is drawn about a mean, each number by itself; each candidate drives the
+same trials, in one batch; the best quarter, weighted by rank, moves the mean and the spread.
+
+Source of the method: R. Y. Rubinstein, Methodology and Computing in Applied Probability 1, 1999;
+the weights are those of CMA-ES (N. Hansen, 2016).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.course.course import Course
+from countersteer.drivers.drift_turn import drift_turn
+from countersteer.drivers.policy import TABLES, Policy
+from countersteer.evaluation.population import Population, draw
+from countersteer.evaluation.rollout import REACHED, Score, rollouts
+from countersteer.simulator import Simulator
+
+SPEEDS = (1.5, 2.0, 2.5, 3.0)  # m/s asked for, by turns
+SLOWEST = 1.1  # m/s: a trial that takes longer is lost
+# Spread that a search begins with, in the units used inside; what is not here stays as it is.
+SPREAD = {
+    "offset": 0.05,
+    "slope": 0.03,
+    "lead": 0.15,
+    "lock": 0.1,
+    "rate": 0.6,
+    "throttle": 0.2,
+    "counter": 0.12,
+    "rate_gain": 0.1,
+    "stop_gain": 0.3,
+    "settled": 0.4,
+    "hold_p": 0.3,
+    "hold_d": 0.06,
+    "hold_slip": 0.3,
+    "hold_throttle": 0.1,
+    "slip_aim": 0.1,
+    "slip_gain": 0.4,
+    "lead_grip": 0.5,
+    "rate_grip": 0.5,
+}
+KEEPS, STAYS = 0.35, 0.75  # of the mean, and of the spread, from one generation to the next
+WANTED, LEAST, MOST = 37.0, 28.0, 48.0  # degrees of sideslip
+
+
+class Generation(NamedTuple):
+    """What a generation came to: of its mean, and of its best candidate."""
+
+    cost: float
+    success_rate: float
+    best_cost: float
+
+
+def cost(score: Score) -> np.ndarray:
+    """Of each trial: failure, sideslip that is missing or too much, and heading errors squared."""
+    turns, won = score.turns, score.status == REACHED
+    ended = np.isfinite(turns.end)
+    done = ended.sum(axis=1)
+    slip, error = np.degrees(turns.peak_sideslip), np.abs(np.degrees(turns.error))
+    missing = np.clip(WANTED - slip, 0, 20) / 10 + 1.2 * np.clip((LEAST - slip) / 4, 0, 1)
+    much = np.clip(slip - MOST, 0, 40) / 20
+    each = missing + much + 0.35 * np.minimum(error / 3, 6.0) ** 2
+    turned = np.where(ended, each, 0.0).sum(axis=1) / np.maximum(done, 1)
+    failed = np.where(won, 0.0, 6.0 + 2.0 * (1 - done / ended.shape[1]))
+    total: np.ndarray = failed + turned
+    return total
+
+
+def search(
+    courses: Sequence[Course],
+    car: Car,
+    population: Population,
+    begin: Policy,
+    generations: int,
+    candidates: int = 32,
+    trials: int = 48,
+    spread: float = 0.5,
+    seed: int = 0,
+    report: Callable[[int, Generation], None] = lambda *_: None,
+) -> Policy:
+    """The policy that it ends at, from one to begin with; each generation drives one course.
+
+    `spread` is over `SPREAD`. Trials take the seeds from 1000 + `seed` on, others each generation.
+    """
+    rng, mean = np.random.default_rng(seed), flat(begin)
+    deviation = spread * np.concatenate(
+        [np.full(np.size(value), SPREAD[name]) for name, value in _numbers(begin)]
+    )
+    best = max(candidates // 4, 1)
+    weights = np.log(best + 0.5) - np.log(np.arange(1, best + 1))
+    weights /= weights.sum()
+    for number in range(generations):
+        tried = mean + deviation * rng.standard_normal((candidates, len(mean)))
+        tried[0] = mean
+        seeds = range(1000 + seed + number * trials, 1000 + seed + (number + 1) * trials)
+        policies = [shaped(begin, numbers) for numbers in tried]
+        score = drive(courses[number % len(courses)], car, population, policies, seeds)
+        costs = cost(score).reshape(candidates, trials).mean(axis=1)
+        won = np.mean(score.status[:trials] == REACHED)
+        elite = tried[np.argsort(costs)[:best]]
+        report(number, Generation(float(costs[0]), float(won), float(costs.min())))
+        about = np.sqrt(weights @ (elite - mean) ** 2)
+        mean = KEEPS * mean + (1 - KEEPS) * (weights @ elite)
+        deviation = STAYS * deviation + (1 - STAYS) * about
+    return shaped(begin, mean)
+
+
+def drive(
+    course: Course,
+    car: Car,
+    population: Population,
+    policies: Sequence[Policy],
+    seeds: Sequence[int],
+) -> Score:
+    """Every policy over the same trials: as many trials for the first policy, then the next."""
+    drawn = draw(population, car, course, seeds, np.float32)
+    plain = {speed: drift_turn(course, car, speed) for speed in SPEEDS}
+    drivers = [
+        dataclasses.replace(plain[SPEEDS[i % len(SPEEDS)]], **policy._asdict())
+        for policy in policies
+        for i in range(len(seeds))
+    ]
+    rows = np.tile(np.arange(len(seeds)), len(policies))
+    many: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], drawn)
+    simulator = Simulator(course, jax.tree.map(np.float32, car), drivers[0])
+    longest = (course.lap_end(1) or 0.0) / SLOWEST
+    return rollouts(simulator, many, drivers, [seeds[i] for i in rows], 1, longest)
+
+
+def _numbers(policy: Policy) -> list[tuple[str, Any]]:
+    """The numbers that are searched, by name, in an order of their own."""
+    return [
+        (name, getattr(getattr(policy, part), name))
+        for part, (_, entries) in TABLES.items()
+        for name in entries
+        if name in SPREAD
+    ]
+
+
+def flat(policy: Policy) -> np.ndarray:
+    """All of them in a row."""
+    return np.concatenate([np.ravel(value) for _, value in _numbers(policy)])
+
+
+def shaped(like: Policy, numbers: np.ndarray) -> Policy:
+    """The inverse of `flat`; what is not searched is that of `like`."""
+    parts, first = {}, 0
+    for part, (_, entries) in TABLES.items():
+        table, changes = getattr(like, part), {}
+        for name in entries:
+            if name in SPREAD:
+                size = np.size(getattr(table, name))
+                values = numbers[first : first + size]
+                changes[name] = values if np.ndim(getattr(table, name)) else float(values[0])
+                first += size
+        parts[part] = dataclasses.replace(table, **changes)
+    return Policy(**parts)
