@@ -27,7 +27,7 @@ DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
 SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
 GATE = 3.0  # standard deviations beyond which a reading is a spike
 FOLLOWS, STEADY = 0.15, 2  # m from one reading to the next at most, and how often in a row
-AGREE, INSIST = 0.08, 12  # m within which so many of them in a row agree, and are no spikes
+AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
 
 
 class Memory(NamedTuple):
