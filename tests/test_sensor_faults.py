@@ -124,7 +124,7 @@ def test_faults_come_before_the_radio() -> None:
     with jax.enable_x64(True):
         around, loop = simulator.begin(plan)
         loop, _ = scan(plan, 500, CAR, around, driver, loop)
-        _, told = observe(plan, jax.tree.map(jnp.asarray, loop))
+        _, told = observe(plan, around, jax.tree.map(jnp.asarray, loop))
     assert all(np.isinf(heard.age) for heard in told.sonar)
     assert 0 < float(told.gyroscope.age) < 0.2
 

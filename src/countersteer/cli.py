@@ -24,6 +24,7 @@ DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 DRIVERS = ("drift-turn", "straighten")
 EXPERIMENTS = (
     "turn-rate", "drift-threshold", "stop-time", "drift-turn", "control-rate", "battery",
+    "linked-turns",
     "narrowest-corner",
 )  # fmt: skip
 LONGEST_REPLAY = 3600.0  # s
