@@ -21,7 +21,6 @@ from countersteer.errors import InputError
 from countersteer.estimation import lidar_walls
 
 STRAIGHT, SPIN, STOP, SETTLE = 0, 1, 2, 3
-SHARP = 0.4  # part of an arc's lead beyond that of 90°
 SPEED = 2.0  # m/s, unless another is asked for
 NEWS = 0.03  # m, standard deviation of what the front sonar says of the corner's distance
 DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
@@ -116,8 +115,6 @@ class DriftTurn:
 
         speed = jnp.maximum(estimate.vx, 0.5)
         bend = jnp.tan(jnp.minimum(jnp.abs(angle), 2.1) / 2)
-        # Beyond 90° the car comes back on its way in: less is needed than an arc would.
-        bend = jnp.where(bend > 1.0, 1.0 + SHARP * (bend - 1.0), bend)
         lead = own.begins_at(speed, estimate.friction) * bend
         lined_up = jnp.abs(straight.error) < 0.5
         near = (memory.phase == STRAIGHT) & (corner < lead) & lined_up
