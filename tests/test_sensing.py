@@ -141,6 +141,18 @@ def test_a_sonar_hears_the_nearest_echo_that_ray_casting_finds(ping: Callable) -
     assert not wrong, f"seed {seed}: {len(wrong)} of {count} scenes, such as {wrong[:3]}"
 
 
+def test_a_wall_behind_a_corner_is_not_heard_by_its_end(ping: Callable) -> None:
+    """The wall beside the car hides the next one but for the corner, which echoes by chance."""
+    beside, hidden = [-1.0, 0.7, 2.1, 0.7], [2.1, 0.7, 2.1, 3.0]
+    across = [3.5, -2.0, 3.5, 3.0]
+    poses = np.array([[x, 0.0, 0.0] for x in np.linspace(-0.2, 0.4, 25)])
+    for pair in ((beside, hidden), (hidden, beside)):
+        heard = ping(sonars({"front": (0, 0, 0)}), np.array([*pair, across]), poses)[:, 0]
+        behind = np.where(poses[:, 0] >= 0.0, 3.5 - poses[:, 0], np.inf)
+        assert np.where(poses[:, 0] >= 0.0, heard, np.inf) == pytest.approx(behind, abs=2e-3)
+        assert np.isinf(heard[poses[:, 0] < -0.01]).all(), "beyond the reach of 3.5 m"
+
+
 def test_a_sonar_ends_at_its_reach_its_cone_and_an_oblique_wall(ping: Callable) -> None:
     part = sonars({"front": (0, 0, 0)})
 

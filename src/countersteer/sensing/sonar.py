@@ -11,6 +11,7 @@ from countersteer.car.car import Sonar
 from countersteer.car.parameter import Scalar
 
 PAST = 1e-5  # rad by which a ray passes the end of a wall
+INSIDE = 1e-3  # m of a wall that must show, for it to return an echo
 MERGED = 1e-4  # m within which ends of walls are one corner
 MOST_WALLS = 24  # that a ping reckons with: in its cone, the nearest ones
 
@@ -123,7 +124,9 @@ def _echo(
         low = jnp.where(change > 0, jnp.maximum(low, root), low)
         high = jnp.where(change > 0, high, jnp.minimum(high, root))
     low, high = jnp.maximum(low, 0.0), jnp.minimum(high, length)
-    at = jnp.clip(foot, low, high)
+    # Not its very end: where two walls meet, that is seen of one that the other hides.
+    inner = jnp.minimum(INSIDE, (high - low) / 2)
+    at = jnp.clip(foot, low + inner, high - inner)
     point = start + at[:, None] * along
     # Where that point is hidden, the wall may still show beyond the end of what hides it.
     ends = jnp.concatenate([start, end])
@@ -132,7 +135,8 @@ def _echo(
     scale = _cross(start, end - start)[None] / jnp.where(jnp.abs(span) > 1e-12, span, jnp.inf)
     glimpse = scale[..., None] * past[:, None]
     place = jnp.sum((glimpse - start) * along, axis=-1)
-    glimpsed = (scale > 0) & (place >= low) & (place <= high)
+    beyond = jnp.sum((glimpse - jnp.concatenate([ends, ends])[:, None]) ** 2, axis=-1)
+    glimpsed = (scale > 0) & (place >= low) & (place <= high) & (beyond > INSIDE**2)
     points = jnp.concatenate([point, glimpse.reshape(-1, 2), corners - jnp.stack([x, y])])
     reach = jnp.sqrt(jnp.sum(points**2, axis=1) + 1e-18)
     ahead = jnp.cos(bearing) * points[:, 0] + jnp.sin(bearing) * points[:, 1]
