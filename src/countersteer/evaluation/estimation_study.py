@@ -37,6 +37,7 @@ from countersteer.world import battery
 
 SET, SPEEDS, COURSES = "around", (1.5, 3.0), ("box", "ess")
 CARS = 256  # of each course
+FIRST = 5000  # seed: the filters' noises were set on those from 0 to 255
 POSES = 128  # drives of each course with a pose filter, which is slow
 FAULT = 0.5  # s that a sensor fails
 FAILING = 8  # cars for each sensor, kind and straight
@@ -394,7 +395,7 @@ PAGE = """# What the estimates are worth
 Made by `make estimation`. Cars drawn from the set `{set}` around `{car}` (each with its own
 tyres, mass, motor, servo, battery, charge, noises, biases and floor), asked for {low:g} to
 {high:g} m/s, drive with the drift-turn driver on the sensors alone. The filters know the nominal
-car only.
+car only; their noises were set on other seeds.
 
 ## The filters
 
@@ -459,10 +460,10 @@ filter's states, and the driver takes offset, angle and corner from the pose.
 
 def write(page: Path, name: str = "rx7", cars: int = CARS) -> None:
     """The page, and the picture beside it."""
-    car, seeds = load_car(name), range(cars)
+    car, seeds = load_car(name), range(FIRST, FIRST + cars)
     studies = {
         "filters": filters(car, seeds, page.with_suffix(".png")),
-        "poses": poses(car, range(min(cars, POSES))),
+        "poses": poses(car, seeds[:POSES]),
         "faults": sensor_faults(car, FAILING),
         "straightening": straightening(car, seeds),
         "sensing": sensing(name, seeds),
