@@ -24,8 +24,7 @@ DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 DRIVERS = ("drift-turn", "straighten")
 EXPERIMENTS = (
     "turn-rate", "drift-threshold", "stop-time", "drift-turn", "control-rate", "battery",
-    "linked-turns",
-    "narrowest-corner",
+    "linked-turns", "narrowest-corner",
 )  # fmt: skip
 LONGEST_REPLAY = 3600.0  # s
 FASTEST_GIF = 50  # frames a second
@@ -54,24 +53,21 @@ def number(low: float, high: float, kind: type = float) -> Callable[[str], Any]:
     return read
 
 
-def speeds(text: str) -> tuple[float, float]:
-    """A range of speeds LO:HI, or one."""
-    low, _, high = text.partition(":")
-    read = number(0.2, 20)
-    ends = (read(low), read(high or low))
-    if ends[0] > ends[1]:
-        raise argparse.ArgumentTypeError(f"must rise, not {text}")
-    return ends
+def span(low: float, high: float) -> Callable[[str], tuple[float, float]]:
+    """A range LO:HI within bounds, or one number for both."""
+
+    def read(text: str) -> tuple[float, float]:
+        first, _, last = text.partition(":")
+        one = number(low, high)
+        ends = (one(first), one(last or first))
+        if ends[0] > ends[1]:
+            raise argparse.ArgumentTypeError(f"must rise, not {text}")
+        return ends
+
+    return read
 
 
-def charges(text: str) -> tuple[float, float]:
-    """A range of charge LO:HI, or one."""
-    low, _, high = text.partition(":")
-    read = number(0, 1)
-    ends = (read(low), read(high or low))
-    if ends[0] > ends[1]:
-        raise argparse.ArgumentTypeError(f"must rise, not {text}")
-    return ends
+SPEEDS, CHARGES = span(0.2, 20), span(0, 1)  # m/s; of a battery
 
 
 def parser() -> Parser:
@@ -99,17 +95,7 @@ def parser() -> Parser:
 
         return kind
 
-    def nominal_car(made: Parser) -> None:
-        made.add_argument("--car", default="rx7", help="library name or .toml file (default rx7)")
-        made.add_argument(
-            "--set",
-            action="append",
-            default=[],
-            metavar="PATH=VALUE",
-            help="override a parameter of the car (repeatable)",
-        )
-
-    def physics(made: Parser, car: str | None) -> None:
+    def nominal_car(made: Parser, car: str | None = "rx7") -> None:
         default = f"default {car}" if car else "default the run's own, else rx7"
         made.add_argument("--car", default=car, help=f"library name or .toml file ({default})")
         made.add_argument(
@@ -120,6 +106,9 @@ def parser() -> Parser:
             help="override a parameter of the car, such as battery.wear=0.5 (repeatable; "
             "'countersteer list parameters' has them all)",
         )
+
+    def physics(made: Parser, car: str | None) -> None:
+        nominal_car(made, car)
         made.add_argument("--seed", type=number(0, 2**31 - 1, int), default=0, help="default 0")
         made.add_argument(
             "--dt",
@@ -170,7 +159,7 @@ def parser() -> Parser:
     physics(drive, "rx7")
     drive.add_argument(
         "--speed-mps",
-        type=speeds,
+        type=SPEEDS,
         default=None,
         metavar="V",
         help="speed that the driver is asked to bring to a turn (default the driver's); with "
@@ -182,7 +171,7 @@ def parser() -> Parser:
         help="drive the car, charge and start that --seed draws from this set, as evaluate does",
     )
     drive.add_argument(
-        "--battery", type=number(0, 1), default=1.0, metavar="F", help="charge, 0 to 1 (default 1)"
+        "--battery", type=number(0, 1), metavar="F", help="charge, 0 to 1 (default 1)"
     )
     drive.add_argument(
         "--fault",
@@ -215,7 +204,7 @@ def parser() -> Parser:
     )
     evaluate.add_argument(
         "--speed-mps",
-        type=speeds,
+        type=SPEEDS,
         default=None,
         metavar="LO:HI",
         help="speed that the driver is asked to bring to a turn, drawn for each trial, or one V",
@@ -288,11 +277,11 @@ def parser() -> Parser:
         "--trials", type=number(1, 10**6, int), default=1000, metavar="N", help="default 1000"
     )
     turns.add_argument(
-        "--speed-mps", type=speeds, default=(1.0, 3.0), metavar="LO:HI", help="default 1:3"
+        "--speed-mps", type=SPEEDS, default=(1.0, 3.0), metavar="LO:HI", help="default 1:3"
     )
     turns.add_argument(
         "--battery",
-        type=charges,
+        type=CHARGES,
         default=None,
         metavar="LO:HI",
         help="charge, 0 to 1 (default the set's, or 0.3:1)",
@@ -516,8 +505,12 @@ def run_drive(options: argparse.Namespace) -> int:
 
     course, car = load_course(options.course), load_car(options.car, options.set)
     check_laps(options, course)
-    charge, start, speed, floor = options.battery, None, None, None
+    charge, start, speed, floor = 1.0, None, None, None
+    if options.battery is not None:
+        charge = options.battery
     if options.cars is not None:
+        if options.battery is not None:
+            raise InputError("--battery: --cars draws the charge")
         car, charge, start, speed, floor = drawn_alone(options, course, car)
     elif options.speed_mps is not None:
         speed, most = options.speed_mps
@@ -585,7 +578,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
     nominal, population = load_car(options.car), load_population(options.cars)
     seeds = range(options.seed, options.seed + options.trials)
     trials = evaluate.Trials(
-        course, car, population, seeds, options.speed_mps, options.laps,
+        course, car, nominal, population, seeds, options.speed_mps, options.laps,
         LINKS[options.link], options.estimate, options.dt,
     )  # fmt: skip
     scores = {}
@@ -611,8 +604,11 @@ def run_evaluate(options: argparse.Namespace) -> int:
     for line in evaluate.table_lines(found):
         print(line)
     print(f"picture: {picture}")
-    again = f"countersteer drive {options.course} --cars {options.cars}"
-    print(f"one trial again: {again} --driver D --seed SEED (and the same other options)")
+    words = ["drive", options.course, "--cars", options.cars, "--car", options.car]
+    if options.speed_mps is not None:
+        words += ["--speed-mps", "{:g}:{:g}".format(*options.speed_mps)]
+    print(f"one trial again: countersteer {shlex.join(words)} --driver D --seed SEED, and what")
+    print("else was asked for here: --set, --laps, --link, --estimate, --dt")
     return DONE
 
 
@@ -940,7 +936,8 @@ def run_experiment(options: argparse.Namespace) -> int:
     from countersteer.simulator import keep_programs
 
     # Only the closed loop is worth its time in a compiler that makes a function of it.
-    keep_programs(blocks=options.name == "control-rate", cores=os.cpu_count() or 1)
+    closed = options.name in ("control-rate", "linked-turns")
+    keep_programs(blocks=closed, cores=os.cpu_count() or 1)
     module, car = experiments.load(options.name), load_car(options.car, options.set)
     if options.runs and not hasattr(module, "measure"):
         raise InputError(f"--from: {options.name} is simulated, and measures no run")

@@ -56,7 +56,8 @@ Make = Callable[[Course, Car, float | None], Driver]
 
 def trials(course: Course, car: Car, seeds: Sequence[int]) -> Trials:
     """The trials that all studies are made of."""
-    return Trials(course, car, load_population(SET), seeds, SPEEDS, 1, ONBOARD, "filter", 0.001)
+    cars = load_population(SET)
+    return Trials(course, car, car, cars, seeds, SPEEDS, 1, ONBOARD, "filter", 0.001)
 
 
 def drawn(of: Trials) -> Drawn:

@@ -31,7 +31,8 @@ class Trials:
     """What all drivers of an evaluation have in common."""
 
     course: Course
-    car: Car  # the nominal one
+    car: Car  # the one around which cars are drawn
+    nominal: Car  # the one that drivers and filters know
     population: Population
     seeds: Sequence[int]
     speeds: tuple[float, float] | None  # asked for; None: the driver's own
@@ -64,7 +65,15 @@ class Trials:
             made = {speed: make(speed) for speed in set(drawn.speed.tolist())}
             drivers = [made[speed] for speed in drawn.speed.tolist()]
         car = jax.tree.map(np.float32, self.car)
-        simulator = Simulator(self.course, car, drivers[0], self.link, self.estimate, self.dt)
+        simulator = Simulator(
+            self.course,
+            car,
+            drivers[0],
+            self.link,
+            self.estimate,
+            self.dt,
+            nominal=self.nominal,
+        )
         longest = 3.0 + (self.course.lap_end(self.laps) or 0.0) / SLOWEST
         return watched(
             simulator,
@@ -151,7 +160,10 @@ def table_lines(found: Mapping[str, dict[str, Any]]) -> list[str]:
 
 
 def picture(scores: Mapping[str, Score], title: str, path: Path) -> None:
-    """A picture: heading errors and peak sideslip of all turns, and lap times, by driver."""
+    """A picture: heading errors and peak sideslip of all turns, and lap times, by driver.
+
+    A turn that ended in the midst of a spin counts to the bin at the end.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -162,16 +174,17 @@ def picture(scores: Mapping[str, Score], title: str, path: Path) -> None:
         won, turns = score.status == REACHED, score.turns
         if not np.any(won):
             continue
-        for axes, values in (
-            (errors, np.degrees(turns.error[won]).ravel()),
-            (slips, np.degrees(turns.peak_sideslip[won]).ravel()),
-            (laps, score.goal_time[won]),
+        drawn = {"histtype": "step", "linewidth": 1.5, "label": name}
+        for axes, values, bins in (
+            (errors, np.degrees(turns.error[won]).ravel(), np.linspace(-10, 10, 41)),
+            (slips, np.degrees(turns.peak_sideslip[won]).ravel(), np.linspace(0, 70, 36)),
         ):
-            axes.hist(values, bins=40, histtype="step", linewidth=1.5, label=name)
+            axes.hist(np.clip(values, bins[0], bins[-1]), bins=bins, **drawn)
+        laps.hist(score.goal_time[won], bins=40, **drawn)
     slips.axvline(math.degrees(DRIFT), color="grey", linewidth=0.8)
     for axes, name in (
-        (errors, "heading error at a turn's end, °"),
-        (slips, "peak sideslip of a turn, °"),
+        (errors, "heading error at a turn's end, ° (ends: and beyond)"),
+        (slips, "peak sideslip of a turn, ° (end: and beyond)"),
         (laps, "time to the goal, s"),
     ):
         axes.set_xlabel(name)
