@@ -14,7 +14,9 @@ from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.estimation import dead_reckoning, pose, spikes, velocity
+from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.wall_angle import wall_angle
+from countersteer.sensing.sonar import distances, edges
 from countersteer.sensing.suite import Reading
 from countersteer.simulator import Simulator, padded, scan
 from countersteer.world import battery
@@ -385,3 +387,32 @@ def test_the_pose_settles_from_anywhere_within_two_turns(drives, estimates):
     assert trials >= 8
     assert settled >= 0.95 * trials
     assert np.median(errors) < 0.1
+
+
+@pytest.mark.parametrize("name", ["box", "ess"])
+def test_the_pose_filter_expects_what_a_sonar_reports(name):
+    """Without noise and chance, anywhere in the corridor: the echo of the same wall, or none."""
+    course = load_course(name)
+    sonar = varied(NOMINAL, {
+        "sensors.sonar.noise": 0.0, "sensors.sonar.resolution": 0.0,
+        "sensors.sonar.edge_echo": 0.0, "sensors.sonar.hearing": 0.0,
+    }).sensors.sonar  # fmt: skip
+    walls = jnp.asarray(padded(course.walls, SINGLE))
+    corners = jnp.asarray(edges(padded(course.walls, SINGLE)))
+    place = pose.PoseFilter(walls=walls, sonar=sonar)
+    with jax.enable_x64(False):
+        still = Estimate(*jnp.zeros(6, SINGLE))
+        cloud = place.uniform(course, jax.random.key(1), 4000, still)
+
+        @jax.jit
+        @jax.vmap
+        def told(x, y, heading):
+            fires = (np.float32(1),) * 3
+            return distances(sonar, walls, corners, (x, y, heading), fires, jax.random.key(0))
+
+        reported = np.stack(told(cloud.x, cloud.y, cloud.heading))
+        expected = np.stack(jax.jit(place.expected)(cloud.x, cloud.y, cloud.heading))
+    expected = np.where(expected <= sonar.reach, np.maximum(expected, sonar.nearest), 99.0)
+    reported = np.where(np.isfinite(reported), reported, 99.0)
+    assert np.mean(reported < 99) > 0.5
+    assert np.mean(np.abs(expected - reported) < 0.01) > 0.99

@@ -16,6 +16,7 @@ from countersteer.car.car import Sonar
 from countersteer.car.parameter import Scalar, pytree
 from countersteer.course.course import Course
 from countersteer.estimation.estimate import Estimate
+from countersteer.sensing.sonar import MERGED
 from countersteer.sensing.suite import Reading
 from countersteer.world.chassis import Symmetric
 
@@ -158,13 +159,16 @@ class PoseFilter:
 
         Of each wall the nearest point within the cone counts, which is its foot where that is
         inside, else where one of the cone's edges cuts it, and not beyond the greatest obliqueness.
-        What hides what is left out: the nearest wall is never hidden. No echo is infinite.
+        The nearest of them is hidden by no other wall, but a wall of which only the end is in sight
+        may be by the one that it meets there, and then it does not count. No echo is infinite.
         """
+        met = _met(self.walls)
         cosine, sine = jnp.cos(heading), jnp.sin(heading)
         return [
             _nearest(
                 self.sonar,
                 self.walls,
+                met,
                 x + cosine * mount.x - sine * mount.y,
                 y + sine * mount.x + cosine * mount.y,
                 heading + mount.angle,
@@ -242,8 +246,23 @@ def located(memory: Located, now: Estimate) -> Estimate:
     )
 
 
+def _met(walls: jax.Array) -> jax.Array:
+    """(2, n, 2): the way that another wall takes from each wall's ends; zeros where none does."""
+    starts, stops = walls[:, :2], walls[:, 2:]
+    ends, others = jnp.concatenate([starts, stops]), jnp.concatenate([stops, starts])
+    apart = jnp.sum((ends[:, None] - ends) ** 2, axis=-1)
+    meets = (apart < MERGED**2) & ~jnp.eye(len(ends), dtype=bool)
+    way = jnp.where(meets[..., None], others - ends, 0.0).sum(axis=1)
+    return jnp.reshape(way, (2, -1, 2))
+
+
 def _nearest(
-    sonar: Sonar, walls: jax.Array, x: jax.Array, y: jax.Array, bearing: jax.Array
+    sonar: Sonar,
+    walls: jax.Array,
+    met: jax.Array,
+    x: jax.Array,
+    y: jax.Array,
+    bearing: jax.Array,
 ) -> jax.Array:
     """(particles,): the nearest of all walls' nearest points within the cone."""
     ax, ay, bx, by = (walls[:, i] - at[:, None] for i, at in enumerate((x, y, x, y)))
@@ -264,4 +283,15 @@ def _nearest(
         high = jnp.where(change > 0, high, jnp.minimum(high, root))
     at = jnp.clip(foot, low, high)
     distance = jnp.sqrt(away**2 + (at - foot) ** 2)
-    return jnp.min(jnp.where(low <= high, distance, jnp.inf), axis=1)
+    # At an end, the wall met there hides this one if it goes off between the sonar and this one.
+    shows = low <= high
+    for end, sign, (to_x, to_y) in (
+        (at <= 0.0, 1.0, (-ax, -ay)),
+        (at >= length, -1.0, (-ax - length * ux, -ay - length * uy)),
+    ):
+        way_x, way_y = met[0 if sign > 0 else 1].T
+        before = to_x * way_y - to_y * way_x
+        behind = sign * (way_x * uy - way_y * ux)
+        turn = sign * (to_x * uy - to_y * ux)
+        shows = shows & ~(end & (before * behind > 0) & (before * turn > 0))
+    return jnp.min(jnp.where(shows, distance, jnp.inf), axis=1)
