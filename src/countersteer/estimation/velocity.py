@@ -43,7 +43,7 @@ MEMORY = 0.2  # s for which that error stays the same
 SLIDES = 1.5  # m/s: the same where the axle slides
 ADHERES = 0.12  # rad of slip angle up to which an axle holds
 USED = 0.6  # part of the nominal friction up to which it does
-SMOOTH = 0.03  # s over which accelerations are looked at
+SMOOTH = 0.01  # s over which accelerations are looked at
 LATE = 2.5  # periods of a sensor after which its last reading tells nothing
 REPEATS = 20  # equal readings after which a sensor counts as stuck
 SWING = 60.0  # rad/s² of yaw acceleration, and
@@ -300,15 +300,22 @@ def update(
     lever = body.yaw_inertia * yaw_acceleration / body.mass
     rear_load = (body.front_axle * GRAVITY + body.cm_height * accel_x) / body.wheelbase
     rear_pull = (accel_y * body.front_axle - lever) / (body.wheelbase * rear_load)
+    # What pushes forward is the wheels' pull, less what the front axle's side force holds back.
+    front_push = (accel_y * behind + lever) / body.wheelbase
+    pull = (accel_x + jnp.tan(actuators.steering) * front_push) / GRAVITY
     grip = jnp.minimum(car.tires.rear.peak_friction, car.tires.front.peak_friction)
     used = jnp.sqrt(accel_x**2 + accel_y**2) / (GRAVITY * grip)
     holds = rolls & (used < USED)
+    # A tread gives more than in proportion to its pull: the brush model's law, turned round.
+    share = jnp.sqrt(pull**2 + rear_pull**2) / (memory.friction * car.tires.rear.peak_friction)
+    share = jnp.clip(share, 0.01, 0.9)
+    gives = 3 * (1 - jnp.cbrt(1 - share)) / share
 
     # The encoder's wheel: `rolled` is what it has rolled since the regions counted so far.
     side = {"rear-left": 1.0, "front-left": 1.0, "rear-right": -1.0, "front-right": -1.0}
     arm = side.get(sensors.encoder.on, 0.0) * body.track / 2
     tire = car.tires.rear if "rear" in sensors.encoder.on else car.tires.front
-    stretch = 1 + accel_x / (GRAVITY * car.tires.rear.longitudinal_stiffness)
+    stretch = 1 + gives * pull / tire.longitudinal_stiffness
     known = jnp.where(holds, HOLDS, SLIDES) ** 2 * 2 * MEMORY * h_settled
     # A wheel that keeps rolling otherwise than it should: then it is the speed that is wrong.
     astray = jnp.where(memory.lost >= LOST, UNSURE**2 * h_settled, 0.0)
@@ -368,7 +375,7 @@ def update(
     lost = jnp.where(counted, jnp.where(taken | (passed == 0), 0, memory.lost + 1), memory.lost)
 
     # The rear axle's tread creeps sideways by the slip angle that its pull takes.
-    creep = -jnp.abs(mean[VX]) * rear_pull / car.tires.rear.cornering_stiffness
+    creep = -jnp.abs(mean[VX]) * gives * rear_pull / car.tires.rear.cornering_stiffness
     mean, covariance, _ = correct(
         mean,
         covariance,

@@ -11,6 +11,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import Array, Scalar
 from countersteer.sensing import lidar, parts, sonar
 from countersteer.world import drivetrain, motor
+from countersteer.world.chassis import Vector
 from countersteer.world.state import Motion
 
 POSITION = ("position_x", "position_y", "position_heading")
@@ -70,8 +71,7 @@ class Memory(NamedTuple):
     disc: Scalar  # place of the eye within a region of the encoder's disc, 0 to 1
     counts: Scalar
     counts_before: Scalar  # at the last report
-    vx: Scalar  # at the accelerometer's last report
-    vy: Scalar
+    velocity: Vector  # at the accelerometer's last report
     eye: Scalar | None  # place of the line detector's eye (m)
     poses: Array | None = None  # (delay in ticks + 1, 3), a slot a tick: what position is to tell
 
@@ -116,7 +116,8 @@ def initial_memory(car: Car, motion: Motion, dt: float) -> Memory:
             readings = readings._replace(position_heading=none)
         pose = np.array([motion.x, motion.y, motion.heading], dtype)
         poses = np.tile(pose, (round(float(np.max(sensors.position.delay)) / dt) + 1, 1))
-    return Memory(readings, zero, zero, zero, motion.vx, motion.vy, eye, poses)
+    velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
+    return Memory(readings, zero, zero, zero, velocity, eye, poses)
 
 
 def sense(
@@ -169,8 +170,14 @@ def sense(
     def weigh(readings: Readings) -> Readings:
         noise = jax.random.normal(jax.random.fold_in(key, 2), (2,), dtype=dtype)
         time = (tick - jnp.maximum(readings.accel_x.tick, 0)) * dt
-        ax = (motion.vx - memory.vx) / time - motion.yaw_rate * motion.vy
-        ay = (motion.vy - memory.vy) / time + motion.yaw_rate * motion.vx
+        # The mean since the last report, of the turning too: else a turn that begins is felt early.
+        before = memory.velocity
+        ax = (motion.vx - before.x) / time - (
+            before.yaw * before.y + motion.yaw_rate * motion.vy
+        ) / 2
+        ay = (motion.vy - before.y) / time + (
+            before.yaw * before.x + motion.yaw_rate * motion.vx
+        ) / 2
         x, y = parts.accelerometer(sensors.accelerometer, ax, ay, noise)
         return readings._replace(accel_x=Reading(x, tick), accel_y=Reading(y, tick))
 
@@ -237,8 +244,14 @@ def sense(
     return memory._replace(
         readings=readings,
         counts_before=jnp.where(counted, memory.counts, memory.counts_before),
-        vx=jnp.where(weighed, motion.vx, memory.vx),
-        vy=jnp.where(weighed, motion.vy, memory.vy),
+        velocity=Vector(
+            *(
+                jnp.where(weighed, new, old)
+                for new, old in zip(
+                    (motion.vx, motion.vy, motion.yaw_rate), memory.velocity, strict=True
+                )
+            )
+        ),
     )
 
 
