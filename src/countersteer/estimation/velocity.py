@@ -36,9 +36,9 @@ ACCEL_BIAS = 0.06  # m/s²
 WANDER = 0.001  # of the gyroscope's bias, rad/s per root second
 START = 0.02  # heading at the start, rad
 JERK = 1.5  # by which the yaw rate changes, rad/s per root second
-HOLDS = 0.0088  # m/s: how well a wheel that holds is known to roll,
-KEEPS = 0.0045  # m/s: and an axle that holds not to slide
-CREEPS = 0.2  # part by which the rear axle's creep is not what its tyre's stiffness makes of it
+HOLDS = 0.008  # m/s: how well a wheel that holds is known to roll,
+KEEPS = 0.0022  # m/s: and an axle that holds not to slide
+CREEPS = 0.085  # part by which the rear axle's creep is not what its tyre's stiffness makes of it
 MEMORY = 0.2  # s for which that error stays the same
 SLIDES = 1.5  # m/s: the same where the axle slides
 ADHERES = 0.12  # rad of slip angle up to which an axle holds
@@ -298,11 +298,14 @@ def update(
 
     # How hard the axles work, and whether they hold.
     lever = body.yaw_inertia * yaw_acceleration / body.mass
+    front_push = (accel_y * behind + lever) / body.wheelbase
+    bend = jnp.tan(actuators.steering)
+    # The front axle's outer wheel bears more, and holds back more: that turns the car as well.
+    lever = lever + bend * front_push * body.cm_height * accel_y / GRAVITY
     rear_load = (body.front_axle * GRAVITY + body.cm_height * accel_x) / body.wheelbase
     rear_pull = (accel_y * body.front_axle - lever) / (body.wheelbase * rear_load)
     # What pushes forward is the wheels' pull, less what the front axle's side force holds back.
-    front_push = (accel_y * behind + lever) / body.wheelbase
-    pull = (accel_x + jnp.tan(actuators.steering) * front_push) / GRAVITY
+    pull = (accel_x + bend * front_push) / GRAVITY
     grip = jnp.minimum(car.tires.rear.peak_friction, car.tires.front.peak_friction)
     used = jnp.sqrt(accel_x**2 + accel_y**2) / (GRAVITY * grip)
     holds = rolls & (used < USED)
