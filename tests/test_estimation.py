@@ -192,6 +192,15 @@ def test_battery_and_friction_are_felt(drives, estimates):
     assert rms(estimate.friction[-1] - friction) < 0.85 * rms(friction - 1)
 
 
+def test_a_weak_servo_is_felt(drives, estimates):
+    """One that turns too far ends at the lock's limit, as the nominal one does."""
+    gain, told = np.asarray(drives.cars.servo.gain_left), estimates[0].servo[-1]
+    weak = gain < 1
+    assert weak.sum() >= 4
+    assert rms((told - gain)[weak]) < 0.05 < gain[weak].std()
+    assert np.all(told[~weak] > 0.93)
+
+
 def broken(reading, kind):
     """A reading's record from 2 s on as a broken sensor would give it."""
     after = TICK[:, None] >= 2000

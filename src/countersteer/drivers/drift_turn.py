@@ -27,6 +27,7 @@ DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
 SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
 GATE = 3.0  # standard deviations beyond which a reading is a spike
 FOLLOWS, STEADY = 0.15, 2  # m from one reading to the next at most, and how often in a row
+RESTS = (0.17, 1.0)  # sideslip and yaw rate (rad/s) under which a linked turn may follow
 AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
 
 
@@ -86,7 +87,7 @@ class DriftTurn:
     by: str = dataclasses.field(default="wall", metadata={"static": True})
     lidar: Lidar | None = None  # where the car has one, it looks for the corner instead
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
-    linked: Scalar = 0.0  # 1: a turn begins as soon as the one before is stopped, walls or not
+    linked: Scalar = 0.0  # 1: a turn begins as soon as the slide of the last ends, walls or not
     longest: Scalar = 1.2  # s that a phase of a turn may take
 
     def reset(self, key: jax.Array) -> Memory:
@@ -119,7 +120,8 @@ class DriftTurn:
         lined_up = jnp.abs(straight.error) < 0.5
         near = (memory.phase == STRAIGHT) & (corner < lead) & lined_up
         fast = (memory.turn > 0) | (estimate.vx > 0.9 * self.straight.speed)
-        free = (memory.phase == STRAIGHT) | (memory.phase == SETTLE)
+        rests = (jnp.abs(estimate.vy) < RESTS[0] * speed) & (jnp.abs(estimate.yaw_rate) < RESTS[1])
+        free = (memory.phase == STRAIGHT) | ((memory.phase == SETTLE) & rests)
         begins = jnp.where(self.linked > 0, free & fast, near) & (angle != 0)
         straight = self.straight.turned(straight, angle + (1 - self.carry) * straight.error, begins)
         hand = jnp.where(begins, jnp.sign(angle), memory.hand)
@@ -128,8 +130,9 @@ class DriftTurn:
         left_over = -hand * straight.error
         rate = hand * estimate.yaw_rate
         still = self.stop_angle.angle(speed, jnp.maximum(rate, 0.0))
+        still = own.still(still, estimate.servo)
         slip = -hand * jnp.arctan2(estimate.vy, speed)
-        missing = left_over - still + own.beyond(slip, still)
+        missing = left_over - still + own.beyond(slip, still, estimate.servo)
         late = now - memory.since > self.longest
         stops = (memory.phase == SPIN) & ((missing <= 0) | late)
         settles = (memory.phase == STOP) & ((rate < own.settled) | late)
@@ -148,7 +151,7 @@ class DriftTurn:
             + own.hold_slip * front_slip
         )
         battery = jnp.clip(estimate.battery, 0.5, 1.2)
-        spin = own.spin(entry, rate, estimate.friction, battery)
+        spin = own.spin(entry, rate, estimate.friction, battery, estimate.servo)
         stop = own.stop(entry, missing)
         on = self.straight.command(straight, seen, self.straight.speed)
         steering, throttle = on.steering, on.throttle

@@ -11,10 +11,11 @@
     [source]
     stop_angle = "where these numbers are from"
 
-Tables hold a number for each speed. A table that is not there is that of the library's
-`drift-turn.toml`, which has them all.
+Tables hold a number for each speed. Numbers with a default in `Turning` may be left out. A table
+that is not there is that of the library's `drift-turn.toml`, which has them all.
 """
 
+import dataclasses
 import functools
 import importlib.resources
 from collections.abc import Mapping
@@ -87,6 +88,9 @@ TABLES: dict[str, tuple[type, dict[str, Entry]]] = {
             "slip_gain": Entry("slip_gain", False, "1", -10, 10),
             "lead_grip": Entry("lead_grip", False, "1", -10, 10),
             "rate_grip": Entry("rate_grip", False, "1", -10, 10),
+            "rate_servo": Entry("rate_servo", False, "1", -10, 10),
+            "stop_servo": Entry("stop_servo", False, "1", -10, 10),
+            "aim_servo": Entry("aim_servo", False, "1", -10, 10),
         },
     ),
 }
@@ -130,9 +134,12 @@ def _read(where: str, part: str, table: Any) -> Any:
         if key not in names:
             raise unknown_key(where, f"{part}.{key}", {f"{part}.{k}": 0 for k in names})
     values: dict[str, Any] = {}
+    optional = {f.name for f in dataclasses.fields(made) if f.default is not dataclasses.MISSING}
     for field, entry in entries.items():
         key = f"{part}.{entry.name}"
         if entry.name not in table:
+            if field in optional:
+                continue
             raise InputError(f"{where}: {key} is missing")
         value = table[entry.name]
         if not entry.by_speed:

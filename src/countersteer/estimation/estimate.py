@@ -25,6 +25,8 @@ class Estimate(NamedTuple):
     friction_deviation: Scalar = 0.0
     battery: Scalar = 1.0  # open-circuit voltage over the nominal car's full pack's
     battery_resistance: Scalar = 0.0  # inside the pack, ohm
+    servo: Scalar = 1.0  # how far it turns, over the nominal car's
+    servo_deviation: Scalar = 0.0
     velocity_covariance: Symmetric = Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # vx, vy, yaw rate
     pose_covariance: Symmetric = Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # x, y, heading
 

@@ -4,7 +4,8 @@ From one reading of the accelerometer to the next, that carries the velocity on:
 the tyres do, so a drift needs no tyre model. Its bias would let sideways speed run away within
 seconds; while the tyres hold, the rear axle hardly moves sideways and the encoder's wheel rolls,
 and both say so. Between readings, and where a sensor has died or is stuck, the nominal car's single
-track goes on. Friction is felt where the rear axle slides, the battery under the motor's current.
+track goes on. Friction is felt where the rear axle slides, the battery under the motor's current,
+the servo where the front tyres hold.
 
 A car whose place is told from outside (`sensors.position`) has its place among the states; what is
 told is of an instant before, by the sensor's delay, and is compared with where the car was then.
@@ -19,7 +20,7 @@ import numpy as np
 
 from countersteer.car.car import GRAVITY, Car
 from countersteer.car.parameter import Scalar
-from countersteer.estimation import battery, kalman, single_track
+from countersteer.estimation import battery, kalman, single_track, steering
 from countersteer.estimation.battery import Pack
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.kalman import Covariance, correct, entry, predict
@@ -98,6 +99,7 @@ class Memory(NamedTuple):
     friction: Scalar  # of the rear axle, over the nominal
     friction_variance: Scalar
     pack: Pack
+    servo: steering.Servo
     actuators: Actuators
     gyroscope: Sense
     accelerometer: Sense  # forward,
@@ -143,6 +145,7 @@ def initial_memory(car: Car, pose: tuple[float, float, float], dtype: np.dtype) 
         friction=one,
         friction_variance=one * FRICTION**2,
         pack=battery.initial(car),
+        servo=steering.initial(),
         actuators=Actuators(zero, zero),
         gyroscope=quiet,
         accelerometer=quiet,
@@ -306,13 +309,16 @@ def update(
     rear_pull = (accel_y * body.front_axle - lever) / (body.wheelbase * rear_load)
     # What pushes forward is the wheels' pull, less what the front axle's side force holds back.
     pull = (accel_x + bend * front_push) / GRAVITY
+    front_load = (behind * GRAVITY - body.cm_height * accel_x) / body.wheelbase
+    driven = car.drivetrain.front_share * GRAVITY * pull
+    cosine, sine = cosine_sine(actuators.steering)
+    front_pull = (front_push - sine * driven) / (cosine * front_load)
     grip = jnp.minimum(car.tires.rear.peak_friction, car.tires.front.peak_friction)
     used = jnp.sqrt(accel_x**2 + accel_y**2) / (GRAVITY * grip)
     holds = rolls & (used < USED)
     # A tread gives more than in proportion to its pull: the brush model's law, turned round.
     share = jnp.sqrt(pull**2 + rear_pull**2) / (memory.friction * car.tires.rear.peak_friction)
-    share = jnp.clip(share, 0.01, 0.9)
-    gives = 3 * (1 - jnp.cbrt(1 - share)) / share
+    gives = steering.gives(share)
 
     # The encoder's wheel: `rolled` is what it has rolled since the regions counted so far.
     side = {"rear-left": 1.0, "front-left": 1.0, "rear-right": -1.0, "front-right": -1.0}
@@ -437,6 +443,20 @@ def update(
         GATE,
     )
 
+    servo = steering.update(
+        memory.servo,
+        actuators.steering,
+        (actuators.steering - memory.actuators.steering) / jnp.maximum(h, 1e-6),
+        jnp.arctan2(mean[VY] + body.front_axle * mean[RATE], mean[VX]),
+        front_pull,
+        car.tires.front.peak_friction,
+        car.tires.front.cornering_stiffness,
+        jnp.minimum(car.servo.limit_left, car.servo.limit_right),
+        mean[VX],
+        measured,
+        h_settled,
+    )
+
     stands = h_settled > 0
     ahead = Vector(
         jnp.where(stands, mean[VX], ahead.x), jnp.where(stands, mean[VY], ahead.y), mean[RATE]
@@ -462,6 +482,7 @@ def update(
             jnp.clip(friction, 0.2, 3.0),
             friction_variance,
             believed,
+            servo,
             actuators,
             gyroscope,
             accelerometer,
@@ -481,6 +502,7 @@ def estimate(car: Car, memory: Memory, dt: float) -> Estimate:
     dtype = jnp.result_type(mean[VX])
     astray = BLIND**2 * SMOOTH * ((memory.tick - memory.settled) * dt).astype(dtype)
     voltage, resistance = memory.pack.mean
+    servo = memory.servo
     pose = Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if len(mean) > X:
         at = ((X, X), (Y, Y), (HEADING, HEADING), (X, Y), (X, HEADING), (Y, HEADING))
@@ -497,6 +519,8 @@ def estimate(car: Car, memory: Memory, dt: float) -> Estimate:
         jnp.sqrt(memory.friction_variance),
         voltage / car.battery.full,
         resistance,
+        servo.mean[0],
+        jnp.sqrt(entry(servo.covariance, 0, 0)),
         Symmetric(
             entry(p, VX, VX) + astray,
             entry(p, VY, VY) + astray,

@@ -86,6 +86,7 @@ def figures(of: Trials, kept: Any) -> dict[str, float]:
     voltage = np.asarray(jax.vmap(battery.open_circuit)(cars.battery, kept.charge))
     resistance = np.asarray(jax.vmap(battery.resistance)(cars.battery))
     friction = cars.tires.rear.friction / nominal.tires.rear.friction
+    servo = cars.servo.gain_left / nominal.servo.gain_left
     bias = cars.sensors.gyroscope.bias
 
     def per(total: np.ndarray, count: np.ndarray) -> float:
@@ -113,6 +114,8 @@ def figures(of: Trials, kept: Any) -> dict[str, float]:
         "gyro_bias_spread_degps": math.degrees(rms(bias - nominal.sensors.gyroscope.bias)),
         "friction": rms(told.friction - friction),
         "friction_spread": rms(friction - 1),
+        "servo": rms((told.servo - servo)[servo < 1]),
+        "servo_spread": rms((servo - 1)[servo < 1]),
         "battery_v": rms(told.battery * full - voltage),
         "battery_spread_v": float(np.std(voltage)),
         "resistance_ohm": rms(told.battery_resistance - resistance),
@@ -169,6 +172,7 @@ def filters(car: Car, seeds: Sequence[int], picture: Path | None) -> list[str]:
             for name, key, unit, form in (
                 ("gyroscope's bias, °/s", "gyro_bias", "_degps", ".2f"),
                 ("friction of the rear axle over the nominal", "friction", "", ".3f"),
+                ("gain of a servo that gives too little", "servo", "", ".3f"),
                 ("open-circuit voltage, V", "battery", "_v", ".3f"),
                 ("battery's resistance, ohm", "resistance", "_ohm", ".4f"),
             )

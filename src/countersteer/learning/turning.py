@@ -44,6 +44,9 @@ SPREAD = {
     "slip_gain": 0.4,
     "lead_grip": 0.5,
     "rate_grip": 0.5,
+    "rate_servo": 0.3,
+    "stop_servo": 0.8,
+    "aim_servo": 0.5,
 }
 KEEPS, STAYS = 0.35, 0.75  # of the mean, and of the spread, from one generation to the next
 WANTED, LEAST, MOST = 37.0, 28.0, 48.0  # degrees of sideslip
