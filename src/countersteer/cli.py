@@ -581,6 +581,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         course, car, nominal, population, seeds, options.speed_mps, options.laps,
         LINKS[options.link], options.estimate, options.dt,
     )  # fmt: skip
+    folder = new_folder(options.out, f"{Path(options.course).stem}-evaluate")
     scores = {}
     with Progress(options.json) as progress:
         for i, name in enumerate(options.driver):
@@ -593,7 +594,6 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
             scores[name] = trials.run(made, report)
     found = {name: evaluate.results(score, seeds) for name, score in scores.items()}
-    folder = new_folder(options.out, f"{Path(options.course).stem}-evaluate")
     result = trials.about() | {"car": options.car, "drivers": found}
     (folder / "evaluate.json").write_text(json.dumps(result, indent=1) + "\n")
     picture = folder / "evaluate.png"
@@ -894,19 +894,20 @@ def run_turns(options: argparse.Namespace) -> int:
         rows = [row for path in options.runs for row in open_turns.of_run(path)]
         tried, title = None, ", ".join(path.name for path in options.runs[:2])
         title += f" and {len(options.runs) - 2} more" if len(options.runs) > 2 else ""
+        folder = new_folder(options.out, "turns")
     else:
         keep_programs(cores=os.cpu_count() or 1)
         car, turning = load_car(options.car, options.set), load_policy(options.driver).turning
         cars = load_population(options.cars) if options.cars else None
         charge = options.battery or (None if cars else (0.3, 1.0))
         seeds = range(options.seed, options.seed + options.trials)
+        folder = new_folder(options.out, "turns")
         with Progress(options.json) as progress:
             rows = open_turns.trial(
                 car, turning, cars, seeds, options.speed_mps, charge, progress.show
             )
         tried, title = options.trials, f"{options.car}, {options.trials} turns"
     table = open_turns.as_table(rows)
-    folder = new_folder(options.out, "turns")
     open_turns.write_rows(folder / "turns.csv", rows)
     open_turns.draw_turns(table, folder / "turns.png", title)
     result: dict[str, Any] = (
@@ -941,12 +942,12 @@ def run_experiment(options: argparse.Namespace) -> int:
     module, car = experiments.load(options.name), load_car(options.car, options.set)
     if options.runs and not hasattr(module, "measure"):
         raise InputError(f"--from: {options.name} is simulated, and measures no run")
+    folder = new_folder(options.out, options.name)
     with Progress(options.json) as progress:
         if options.runs:
             found = module.measure([read_run(path) for path in options.runs])
         else:
             found = module.simulate(car, Path(options.car).stem, progress.show)
-    folder = new_folder(options.out, options.name)
     result = write(found, folder, options.name)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
