@@ -51,6 +51,9 @@ SWING = 60.0  # rad/s² of yaw acceleration, and
 JOLT = (
     500.0  # m/s³ of jerk, that no car makes: readings that differ by more have a spike among them
 )
+FASTEST = 20.0  # m/s, that no wheel of such a car turns at
+SAGS = 0.3  # part of a full pack's voltage, by which no two readings of it differ,
+SAME = 4  # and how many of it are equal in a row until the voltmeter counts as stuck
 STEADY = 4  # readings in a row without, after such a one, until they are believed again
 LEAP = 6.0  # standard deviations of noise by which readings may differ beside that
 BLIND = 2.0  # m/s²: error of the single track's acceleration
@@ -220,12 +223,26 @@ def update(
         memory.sideways, readings.accel_y, accel.rate, tick, dt, jolt
     )
     accel_sound = accel_sound & sideways_sound
+    tire = car.tires.rear if "rear" in sensors.encoder.on else car.tires.front
+    region = jnp.pi * tire.radius / sensors.encoder.regions
     encoder, counted, _ = heard(
-        memory.encoder, readings.counts, 1 / sensors.encoder.update, tick, dt
+        memory.encoder,
+        readings.counts,
+        1 / sensors.encoder.update,
+        tick,
+        dt,
+        FASTEST * sensors.encoder.update / region,
     )
-    voltmeter, probed, _ = heard(
-        memory.voltmeter, readings.battery, sensors.voltmeter.rate, tick, dt
+    rolling = encoder.steady >= STEADY  # a wheel at rest repeats itself: that is no fault
+    voltmeter, probed, probe_sound = heard(
+        memory.voltmeter,
+        readings.battery,
+        sensors.voltmeter.rate,
+        tick,
+        dt,
+        SAGS * car.battery.full,
     )
+    probed = probed & probe_sound & (voltmeter.repeats < SAME)
     behind = body.wheelbase - body.front_axle
     seconds = lambda ticks: (ticks * dt).astype(dtype)  # noqa: E731  # used five times
 
@@ -236,7 +253,7 @@ def update(
     slip = jnp.abs(slip_speed) / (jnp.abs(memory.ahead.x) + 0.3)
     rolls = slip < ADHERES
     wheel = readings.wheel_speed.value
-    wheel = jnp.where(jnp.isfinite(wheel), wheel, memory.ahead.x)
+    wheel = jnp.where(jnp.isfinite(wheel) & rolling, wheel, memory.ahead.x)
     rim = jnp.where(rolls, memory.ahead.x, wheel)
     drive = motor.drive(
         car.motor,
@@ -323,7 +340,6 @@ def update(
     # The encoder's wheel: `rolled` is what it has rolled since the regions counted so far.
     side = {"rear-left": 1.0, "front-left": 1.0, "rear-right": -1.0, "front-right": -1.0}
     arm = side.get(sensors.encoder.on, 0.0) * body.track / 2
-    tire = car.tires.rear if "rear" in sensors.encoder.on else car.tires.front
     stretch = 1 + gives * pull / tire.longitudinal_stiffness
     known = jnp.where(holds, HOLDS, SLIDES) ** 2 * 2 * MEMORY * h_settled
     # A wheel that keeps rolling otherwise than it should: then it is the speed that is wrong.
@@ -361,8 +377,7 @@ def update(
     rolled = rolled + h_settled * (stretch * (vx + after.x) / 2 - arm * rate)
 
     # The regions counted since: what is left of `rolled` is within one of them.
-    region = jnp.pi * tire.radius / sensors.encoder.regions
-    passed = jnp.where(counted, encoder.value - memory.encoder.value, 0.0)
+    passed = jnp.where(counted & rolling, encoder.value - memory.encoder.value, 0.0)
     backwards = jnp.where(after.x < 0, -1.0, 1.0)
     late = jnp.where(counted, seconds(settled - encoder.tick), 0.0)
     rolled = rolled - backwards * passed * region
@@ -373,7 +388,7 @@ def update(
         {ROLLED: 1.0, VX: -late},
         backwards * region / 2 - (rolled - late * after.x),
         region**2 / 12,
-        counted,
+        counted & rolling,
         GATE,
     )
     # After a slide or a lost report it begins anew within its region.
@@ -381,7 +396,8 @@ def update(
     anew = jnp.where(failed, backwards * region / 2, mean[ROLLED])
     mean = (*mean[:ROLLED], anew, *mean[ROLLED + 1 :])
     covariance = kalman.renewed(covariance, ROLLED, region**2 / 12, failed)
-    lost = jnp.where(counted, jnp.where(taken | (passed == 0), 0, memory.lost + 1), memory.lost)
+    doubts = jnp.where(taken | (passed == 0), 0, memory.lost + 1)
+    lost = jnp.where(counted & rolling, doubts, memory.lost)
 
     # The rear axle's tread creeps sideways by the slip angle that its pull takes.
     creep = -jnp.abs(mean[VX]) * gives * rear_pull / car.tires.rear.cornering_stiffness
