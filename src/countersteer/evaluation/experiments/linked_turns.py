@@ -24,7 +24,7 @@ from countersteer.simulator import Simulator
 TRIALS = 1000
 TURNS = 4
 SPEED = 2.0  # m/s
-LONGEST = 8.0  # s
+LONGEST = 12.0  # s
 FAR = 1e4  # m
 
 
