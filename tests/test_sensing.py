@@ -611,6 +611,16 @@ def test_a_position_without_heading_and_parts_that_are_off_are_not_there(listen:
     assert suite.initial_memory(RX7, start(RX7, 4).motion, DT).poses is None
 
 
+def test_sensors_begin_for_cars_of_a_batch_too() -> None:
+    """Where a car's numbers are traced, how many poses are kept comes from outside."""
+    car = with_part(position=Position(reports="pose"))
+    slots = suite.position_slots(car, DT)
+    begun = jax.eval_shape(
+        lambda car, motion: suite.initial_memory(car, motion, DT, slots), car, start(car, 4).motion
+    )
+    assert begun.poses.shape == (slots, 3)
+
+
 def test_better_sensors_are_switched_on_and_written(tmp_path: Path) -> None:
     wanted = ("sensors.lidar.beams=12", "sensors.lidar.rate_hz=20", "sensors.position.reports=pose")
     car = load_car("rx7", wanted)

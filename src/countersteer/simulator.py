@@ -57,7 +57,8 @@ class Plan(NamedTuple):
     estimate: str  # as in `Simulator`
     filtering: int
     sensors: suite.Periods
-    slots: int  # of the delay lines
+    slots: int  # of the delay lines,
+    told: int  # and of the poses that the position sensor tells late
     fails: bool  # whether any sensor ever does
 
 
@@ -151,6 +152,7 @@ class Simulator:
             control * max(1, round(FILTERING / self.dt / control)),
             suite.periods(self.car, self.dt),
             planar.delay_slots(self.car, self.dt),
+            suite.position_slots(self.car, self.dt),
             bool(self.faults),
         )
 
@@ -242,7 +244,7 @@ def begin(
     """The loop before its first tick, with the pose that the driver believes; `key` is its."""
     dtype, nominal = jnp.result_type(car.body.mass), around.nominal
     state = planar.initial_state(car, plan.dt, start, moving, charge, plan.slots)
-    sensors = suite.initial_memory(car, state.motion, plan.dt)
+    sensors = suite.initial_memory(car, state.motion, plan.dt, plan.told)
     zero = dtype.type(0)
     still = Command(zero, zero)
     up = down = None

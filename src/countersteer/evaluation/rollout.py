@@ -31,7 +31,7 @@ from countersteer.evaluation.turns import (
     STRAIGHT_SLIP,
     Judge,
 )
-from countersteer.sensing import sonar
+from countersteer.sensing import sonar, suite
 from countersteer.sensing.faults import Fault
 from countersteer.simulator import Loop, Plan, Simulator, Surroundings, begin, padded, tick
 from countersteer.world import planar
@@ -302,7 +302,8 @@ def watched(
         raise InputError("trials need a course with a goal")
     dtype = np.asarray(drawn.charge).dtype
     slots = planar.delay_slots(drawn.cars, simulator.dt)
-    plan = simulator.plan()._replace(slots=slots, fails=bool(faults))
+    told = suite.position_slots(drawn.cars, simulator.dt)
+    plan = simulator.plan()._replace(slots=slots, told=told, fails=bool(faults))
     walls = padded(course.walls, dtype)
     way = way_of(course, laps, dtype)
     start = initial_score(course, len(way.bearings), dtype.type)

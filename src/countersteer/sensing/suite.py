@@ -96,8 +96,13 @@ def periods(car: Car, dt: float) -> Periods:
     return Periods(*found)
 
 
-def initial_memory(car: Car, motion: Motion, dt: float) -> Memory:
-    """Sensors that have not reported yet."""
+def position_slots(car: Car, dt: float) -> int:
+    """Ticks of poses that are kept until they are told; of many cars, for the latest."""
+    return round(float(np.max(car.sensors.position.delay)) / dt) + 1
+
+
+def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None) -> Memory:
+    """Sensors that have not reported yet. `slots` default to the car's `position_slots`."""
     dtype = jnp.result_type(motion.x).type
     zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
     no_echo = none._replace(value=dtype(np.inf))
@@ -114,8 +119,9 @@ def initial_memory(car: Car, motion: Motion, dt: float) -> Memory:
         readings = readings._replace(position_x=none, position_y=none)
         if sensors.position.reports == "pose":
             readings = readings._replace(position_heading=none)
-        pose = np.array([motion.x, motion.y, motion.heading], dtype)
-        poses = np.tile(pose, (round(float(np.max(sensors.position.delay)) / dt) + 1, 1))
+        slots = position_slots(car, dt) if slots is None else slots
+        pose = jnp.stack([motion.x, motion.y, motion.heading]).astype(dtype)
+        poses = jnp.tile(pose, (slots, 1))
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
     return Memory(readings, zero, zero, zero, velocity, eye, poses)
 
