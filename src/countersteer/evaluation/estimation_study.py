@@ -306,10 +306,15 @@ def straightening(car: Car, seeds: Sequence[int]) -> list[str]:
         "| | offset, RMS | angle, RMS | as known: offset | angle | success | heading error, RMS |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
-    for where, make in (("straight", straighten), ("box", drift_turn), ("ess", drift_turn)):
+    kinds: tuple[tuple[str, Any, str], ...] = (
+        ("straight", straighten, "by"),
+        ("box", drift_turn, "straight_by"),
+        ("ess", drift_turn, "straight_by"),
+    )
+    for where, make, what in kinds:
         course = load_course(where)
         for by in ("sonar", "filter"):
-            score, kept = errors(course, car, seeds, partial(make, by=by))
+            score, kept = errors(course, car, seeds, partial(make, **{what: by}))
             count = np.sum(kept.straight)
             offset, angle, offset_error, angle_error = (
                 math.sqrt(np.sum(total) / count)
@@ -412,8 +417,8 @@ three numbers, as errors hang together over a drive.
 
 ![The normalised error squared over time](estimation.png)
 
-The bounds hold for a whole drive. By the instant, the filter is too careful in the first second,
-when the car has just stood, and a little too sure in and after the later turns.
+The bounds hold for a whole drive. By the instant, the filter is too careful in the first two
+seconds, when the car has just stood.
 
 The gyroscope's bias is not learned within a lap: while the car drives, little but the gyroscope
 itself tells how fast it turns, so the estimate is as far off as the cars are spread.
