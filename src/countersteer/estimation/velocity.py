@@ -449,13 +449,15 @@ def update(
     sliding = rear.cornering_stiffness * jnp.abs(slip_y) > 4 * rear.friction * memory.friction * (
         wheel + 0.1
     )
+    # Against the turn, the front wheels' pulls differ and turn the car by what is not known here.
+    countersteers = actuators.steering * mean[RATE] < 0
     (friction,), ((friction_variance,),), _ = correct(
         (memory.friction,),
         predict(((memory.friction_variance,),), {}, {0: FORGETS**2 * h_settled}),
         {0: full},
         rear_pull - full * memory.friction,
         (FELT * rear.friction) ** 2 * 2 * MEMORY * per,
-        sliding & measured & (jnp.abs(against) > 0.5),
+        sliding & measured & (jnp.abs(against) > 0.5) & ~countersteers,
         GATE,
     )
 

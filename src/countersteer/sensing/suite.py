@@ -1,6 +1,7 @@
 """All sensors of a car on the shared clock."""
 
 from fractions import Fraction
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -247,17 +248,11 @@ def sense(
         eye = parts.eye(sensors.line_detector, motion.x, motion.heading)
         readings = cross(car, readings, memory.eye, eye, tick, dt)
         memory = memory._replace(eye=eye)
+    moves = Vector(motion.vx, motion.vy, motion.yaw_rate)
     return memory._replace(
         readings=readings,
         counts_before=jnp.where(counted, memory.counts, memory.counts_before),
-        velocity=Vector(
-            *(
-                jnp.where(weighed, new, old)
-                for new, old in zip(
-                    (motion.vx, motion.vy, motion.yaw_rate), memory.velocity, strict=True
-                )
-            )
-        ),
+        velocity=jax.tree.map(partial(jnp.where, weighed), moves, memory.velocity),
     )
 
 
