@@ -78,8 +78,11 @@ def grip_limit(course: Course, car: Car, share: float = 0.85) -> GripLimit:
     spacing = float(np.mean(np.hypot(*steps.T)))
     heading = np.arctan2(steps[:, 1], steps[:, 0])
     turned = np.angle(np.exp(1j * (heading - np.roll(heading, 1))))
-    grip = share * GRAVITY * min(peak_friction(car.tires.front), peak_friction(car.tires.rear))
-    speed, duty = profile(car, np.abs(turned) / spacing, spacing, grip)
+    axles = car.tires.front, car.tires.rear
+    grip = share * GRAVITY * min(peak_friction(tire) for tire in axles)
+    # Where the wheels spin alike, each axle pulls as much as it holds along its wheels.
+    pulls = share * GRAVITY * np.mean([t.longitudinal_ratio * peak_friction(t) for t in axles])
+    speed, duty = profile(car, np.abs(turned) / spacing, spacing, grip, min(1.0, pulls / grip))
     return GripLimit(
         line=line,
         speed=speed,
@@ -113,12 +116,25 @@ def peak_friction(tire: Tire) -> float:
     return float(tire.friction * (4 - 3 * ratio) / (3 - 2 * ratio) ** 2)
 
 
+def drag_of_turning(car: Car, across: Array) -> np.ndarray:
+    """What brush tyres lose to their slip angles at this lateral acceleration (m/s²)."""
+    lost = np.zeros_like(across)
+    behind = (car.body.wheelbase - car.body.front_axle) / car.body.wheelbase
+    for tire, load in ((car.tires.front, behind), (car.tires.rear, 1 - behind)):
+        part = np.clip(across / GRAVITY / tire.friction, 0.0, 1.0)
+        slides = 1 - np.cbrt(1 - part)
+        slip = 3 * tire.friction * slides / tire.cornering_stiffness
+        lost = lost + load * across * slip
+    return lost
+
+
 def profile(
-    car: Car, curvature: np.ndarray, spacing: float, grip: float
+    car: Car, curvature: np.ndarray, spacing: float, grip: float, ratio: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The highest speed at each point, and the motor's duty with which a car follows it.
 
-    Across, v² |curvature| <= grip; along, what is left of the circle, and what the motor can do.
+    Across, v² |curvature| <= grip; along, what is left of the ellipse whose axis along is `ratio`
+    of that across, and what the motor can do beside what turning costs.
     """
     speeds = np.linspace(0.0, FASTEST, 201)
     radius = float(car.tires.rear.radius)
@@ -135,17 +151,19 @@ def profile(
     full, rolls, brakes = pull(1.0), pull(0.0), pull(-1.0)
     top = float(np.interp(0.0, -full, speeds))
     v = np.minimum(np.sqrt(grip / np.maximum(curvature, 1e-6)), top)
-    left = lambda i: np.sqrt(max(0.0, grip**2 - (v[i] ** 2 * curvature[i]) ** 2))  # noqa: E731  # used twice
+    left = lambda i: ratio * np.sqrt(max(0.0, grip**2 - (v[i] ** 2 * curvature[i]) ** 2))  # noqa: E731  # used twice
     for i in [*range(POINTS)] * 2:  # twice round, as the lap has no beginning
-        gain = min(np.interp(v[i - 1], speeds, full), left(i - 1))
-        v[i] = min(v[i], np.sqrt(v[i - 1] ** 2 + 2 * spacing * gain))
+        turning = float(drag_of_turning(car, v[i - 1] ** 2 * curvature[i - 1]))
+        gain = min(np.interp(v[i - 1], speeds, full) - turning, left(i - 1))
+        v[i] = min(v[i], np.sqrt(max(0.0, v[i - 1] ** 2 + 2 * spacing * gain)))
     for i in [*reversed(range(POINTS))] * 2:
         loss = min(np.interp(v[i], speeds, -brakes), left(i))
         v[i - 1] = min(v[i - 1], np.sqrt(v[i] ** 2 + 2 * spacing * loss))
     wanted = (np.roll(v, -1) ** 2 - v**2) / (2 * spacing)
     back_emf = float(car.motor.torque_constant * car.drivetrain.gear_ratio) * v / radius
-    over = wanted - np.interp(v, speeds, rolls)
-    needed = (wanted + np.interp(v, speeds, np.asarray(resists))) * mass * radius
+    turning = drag_of_turning(car, v**2 * curvature)
+    over = wanted + turning - np.interp(v, speeds, rolls)
+    needed = (wanted + turning + np.interp(v, speeds, np.asarray(resists))) * mass * radius
     volts = back_emf + needed * float(
         car.motor.resistance
         / (car.motor.torque_constant * car.drivetrain.gear_ratio * car.drivetrain.efficiency)

@@ -423,17 +423,17 @@ def test_the_example_laps_a_centre_line_and_a_map(grip_limit, tmp_path, capsys, 
     )
     times = []
     for track in tracks:
-        monkeypatch.setattr(sys, "argv", ["grip_limit.py", track, "--laps", "1"])
+        monkeypatch.setattr(sys, "argv", ["grip_limit.py", track, "--laps", "2"])
         with pytest.raises(SystemExit) as ended:
             grip_limit.main()
-        lap, contacts = capsys.readouterr().out.splitlines()
+        _, lap, contacts = capsys.readouterr().out.splitlines()
         assert ended.value.code == 0
         assert contacts == "wall contacts: 0"
-        times.append(float(lap.removeprefix("lap 1: ").removesuffix(" s")))
-        # Not slower than its own plan by more than the start from rest.
+        times.append(float(lap.removeprefix("lap 2: ").removesuffix(" s")))
+        # A flying lap is not slower than its own plan by more than some tracking costs.
         driver = grip_limit.grip_limit(load_course(track), load_car("jetracer"))
         plan = float(np.sum(driver.spacing / driver.speed))
-        assert plan < times[-1] < plan + 1.5
+        assert plan < times[-1] < 1.12 * plan
     assert times[0] == pytest.approx(times[1], rel=0.05)
 
 

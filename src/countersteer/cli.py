@@ -223,7 +223,8 @@ def parser() -> Parser:
         "--battery",
         type=number(0, 1),
         metavar="F",
-        help="charge, 0 to 1 (default: the run's battery_charge, or else 1)",
+        help="charge, 0 to 1 (default: the run's battery_charge, or else 1; with --compare, "
+        "or else what agrees best)",
     )
     replay.add_argument("--compare", action="store_true", help="measured against simulated")
     replay.add_argument(
@@ -729,6 +730,11 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) ->
     if options.json:
         print(json.dumps(result))
         return DONE
+    if not result["battery_told"]:
+        print(
+            f"battery: the log does not tell; {result['battery_charge']:.2f} of a full one agrees "
+            "best (--battery sets it)"
+        )
     print(f"{name}: {result['windows']} windows of {result['horizon_s']:g} s; error at their ends:")
     for quantity, error in result["median_abs_error"].items():
         nothing = result["persistence"]["median_abs_error"][quantity]

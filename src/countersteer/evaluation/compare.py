@@ -6,11 +6,16 @@ speed is at least 0.2 m/s, and at each throttle onset from rest. The reference i
 the state itself where the run was simulated. Where there is neither, it is the logged encoder and
 gyroscope, against simulated ones with the same lag and quantum.
 
+How full the battery was, logs seldom tell, and a pack nearly empty turns the wheels a fifth slower.
+Where `run.toml` does not, it is one number for the whole log, chosen so that the windows agree best
+(`agreeing_charge`); the errors with a full battery stand beside.
+
 A steady drift is predicted by doing nothing. So the same errors are given for the prediction that
 nothing changes (`persistence`), and all of it for those windows in which something does
 (`transient`), and for those in which the car drives forward and slides (`sliding`).
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,16 +23,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from countersteer.car.car import Car
 from countersteer.errors import InputError
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
+from countersteer.tuning import fit
 from countersteer.tuning.windows import (
     CHANGES,
     EARLY,
     QUANTITIES,
     SLOWEST,
+    Measured,
     Reference,
     find_references,
     pieces,
@@ -45,6 +53,8 @@ if TYPE_CHECKING:
 HORIZON = 1.0  # s, unless told
 SAMPLE = 0.01  # s between the instants at which states are compared
 SLIDE = math.radians(20)  # sideslip that a sliding window reaches
+CHARGED_BY = 128  # windows of a log, at most, that its battery is judged by
+CHARGE_WITHIN = 0.01  # of a full one
 
 
 class Compared(NamedTuple):
@@ -70,14 +80,13 @@ def compare(
     Windows that lack a reference are dropped; raises `InputError` where none is left.
 
     Not in the log and taken as known: nothing was asked of the car before the first command; the
-    battery is as full as `run.toml` says, or else full; the servo is where the car's own law puts
-    it for these commands.
+    servo is where the car's own law puts it for these commands; the battery is as `run.toml` says,
+    or else as full as agrees best (then `as_if_full` has the errors with a full one).
     """
     if horizon is not None and not dt <= horizon < math.inf:
         raise InputError(f"--horizon {horizon:g}: give at least a step of {dt:g} s, or run")
     car = jax.tree.map(np.float64, car)
     measured = read_measured(run, car)
-    references = find_references(measured)
     commands = run.commands
     if horizon is None:
         first, last = float(commands["time_s"][0]), float(commands["time_s"][-1])
@@ -94,32 +103,31 @@ def compare(
             f"{run.path}: no window of {ticks * dt:g} s in which the dead-man switch is closed and "
             f"the car starts at {SLOWEST:g} m/s or more, or from rest with a throttle onset"
         )
-    with jax.enable_x64(True):
-        states = states_at(run, car, measured, starts, resting, dt)
-        known = np.isfinite(states.motion.vx + states.motion.vy + states.motion.yaw_rate)
-        starts, resting = starts[known], resting[known]
-        states = jax.tree.map(lambda leaf: leaf[known], states)
-        predicted = simulate(car, states, commands, starts, ticks, dt) if len(starts) else {}
+    told = "battery_charge" in run.about
+    full = {**run.about, "battery_charge": fit.FULL}
+    run = run if told else dataclasses.replace(run, about=full)
     whole = horizon is None
-    windows: list[Window] = []
-    kept = []
-    for i, start in enumerate(starts.tolist()):
-        series = {name: values[i] for name, values in predicted.items()}
-        window = compared(references, series, start * dt, dt, bool(resting[i]), whole)
-        if window is not None:
-            windows.append(window)
-            kept.append(start * dt)
+    simulation = Simulation(run, car, measured, starts, resting, ticks, dt, whole)
+    windows, kept = simulation.windows()
     if not windows:
         raise InputError(
             f"{run.path}: no window of {ticks * dt:g} s has a whole reference: motion capture, or "
             "wheel_speed_mps and gyro_radps in telemetry.csv"
         )
+    charge, as_if_full = run.about["battery_charge"], {}
+    if not told:
+        as_if_full = {"as_if_full": scores(windows)}
+        charge = agreeing_charge(run, car, measured, dt)
+        windows, kept = simulation.windows(charge)
     lively = [window for window in windows if changes(window)]
     sliding = [window for window in windows if slides(window)]
     result = {
         "windows": len(windows),
         "horizon_s": round(ticks * dt, 9),
+        "battery_charge": charge,
+        "battery_told": told,
         **scores(windows),
+        **as_if_full,
         "transient": {"windows": len(lively), **scores(lively)},
         "sliding": {"windows": len(sliding), **scores(sliding)},
     }
@@ -128,11 +136,84 @@ def compare(
         "result": result,
         "starts_s": kept,
         "windows": windows,
-        "measured": {name: reference.signal for name, reference in references.items()},
+        "measured": {n: reference.signal for n, reference in simulation.references.items()},
         "commands": commands,
         "armed": measured.armed,
     }
     return result, series_of_all
+
+
+class Simulation:
+    """A log's windows, simulated from what was measured at their starts."""
+
+    def __init__(
+        self,
+        run: Run,
+        car: Car,
+        measured: Measured,
+        starts: np.ndarray,
+        resting: np.ndarray,
+        ticks: int,
+        dt: float,
+        whole: bool,
+    ) -> None:
+        """Windows of so many ticks; see `compared` for `whole`."""
+        self.car, self.commands, self.ticks, self.dt = car, run.commands, ticks, dt
+        self.references, self.whole = find_references(measured), whole
+        with jax.enable_x64(True):
+            states = states_at(run, car, measured, starts, resting, dt)
+        known = np.isfinite(states.motion.vx + states.motion.vy + states.motion.yaw_rate)
+        self.starts, self.resting = starts[known], resting[known]
+        self.states = jax.tree.map(lambda leaf: leaf[known], states)
+
+    def windows(self, charge: float | None = None) -> tuple[list[Window], list[float]]:
+        """Those that have a reference, and when they start (s); with another charge, if given."""
+        if not len(self.starts):
+            return [], []
+        states, dt = self.states, self.dt
+        if charge is not None:
+            motion = states.motion
+            states = states._replace(motion=motion._replace(charge=0 * motion.charge + charge))
+        with jax.enable_x64(True):
+            predicted = simulate(self.car, states, self.commands, self.starts, self.ticks, dt)
+        found: list[Window] = []
+        kept = []
+        for i, start in enumerate(self.starts.tolist()):
+            series = {name: values[i] for name, values in predicted.items()}
+            window = compared(
+                self.references, series, start * dt, dt, bool(self.resting[i]), self.whole
+            )
+            if window is not None:
+                found.append(window)
+                kept.append(start * dt)
+        return found, kept
+
+
+def agreeing_charge(run: Run, car: Car, measured: Measured, dt: float) -> float:
+    """How full the battery was, by the same cost over windows of a log as `fit` minimises."""
+    ticks = round(fit.HORIZON / dt)
+    starts, resting = window_starts(measured, run.commands, ticks, dt)
+    chosen = np.arange(0, len(starts), max(1, math.ceil(len(starts) / CHARGED_BY)))
+    if not len(chosen):
+        return fit.FULL
+    simulation = Simulation(
+        run, car, measured, starts[chosen], resting[chosen], ticks, dt, whole=False
+    )
+
+    def cost(charge: float) -> float:
+        residuals = [
+            (one.simulated - one.measured) / scale / math.sqrt(len(one.time))
+            for window in simulation.windows(charge)[0]
+            for name, scale in zip(QUANTITIES, fit.SCALES, strict=True)
+            if (one := window.get(name)) is not None
+        ]
+        expected = (charge - fit.FULL) / fit.ABSOLUTE[fit.CHARGE]
+        return float(fit.loss(np.append(np.concatenate([*residuals, []]), expected))[0].sum())
+
+    found = minimize_scalar(
+        cost, bounds=(0.0, fit.FULL), method="bounded", options={"xatol": CHARGE_WITHIN}
+    )
+    return float(found.x) if found.fun < cost(fit.FULL) else fit.FULL
 
 
 # -------------------------------------------------------------------------------------------------

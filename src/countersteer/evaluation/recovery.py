@@ -102,7 +102,7 @@ def recovered(
     with jax.enable_x64(True), tempfile.TemporaryDirectory() as folder:
         runs = [log(true, Path(folder) / f"log-{number}", rng) for number in range(LOGS)]
         logs = read_logs(runs, {BASE: base}, EVERY, BASE)
-        result = fit.fit({BASE: base}, logs.shots, what, logs.run, report)
+        result = fit.fit({BASE: base}, logs.shots, what, report)
     return [
         Case(one.path, fit.value_of(true, one.path), one.value, one.deviation, one.determined)
         for one in result.fitted

@@ -404,23 +404,23 @@ def stuck_encoder(run: Run, track: Track | None) -> Iterator[Fault]:
         at, value = time[first : last + 1], float(speed[first])
         throttle = asked(run, "throttle", at)
         idle = throttle == 0
+        early, late = (np.mean(half) for half in np.array_split(throttle, 2))
+        other = abs(late - early) > 0.2 and min(early, late) < FULL
         why = ""
         if value > 0 and longest(at, idle) >= HELD_ALONE:
             why = "without throttle"
-        if track is not None:
+        elif value > 0 and other and at[-1] - at[0] >= HELD_ALONE:
+            why = "whatever the throttle"
+        elif track is not None:
             vx = track.at(track.vx, at)
             pushed = throttle * np.sign(vx) > DRIVEN
             if value > 0 and longest(at, idle & (value - np.abs(vx) > slack)) >= HELD:
                 why = "without throttle, faster than the car"
             elif longest(at, pushed & (np.abs(vx) - value > slack)) >= HELD:
                 why = "under drive, slower than the car"
-        elif value > 0:
-            early, late = (np.mean(half) for half in np.array_split(throttle, 2))
-            if at[-1] - at[0] >= HELD_ALONE and abs(late - early) > 0.2 and min(early, late) < FULL:
-                why = "whatever the throttle"
-        elif longest(at, np.abs(throttle) >= FULL) >= HELD_ALONE:
+        elif value == 0 and longest(at, np.abs(throttle) >= FULL) >= HELD_ALONE:
             why = "under drive"
-        elif len(gyro):
+        elif value == 0 and len(gyro):
             turning = np.abs(np.interp(at, gyro_time, gyro)) > 1
             if longest(at, turning & (np.abs(throttle) > DRIVEN)) >= HELD:
                 why = "in a turn under drive"
@@ -531,6 +531,11 @@ def _refuse_truth(run: Run, truth: Table) -> None:
     bend = np.angle(np.exp(1j * (course[stride:] - course[:-stride])))
     told = moving[stride:] & moving[:-stride] & (np.abs(bend) > 0.05)
     _no_degrees(file, "heading_rad", begins[stride:], turned[stride:], bend, told)
+    rate = np.abs(turned) / over
+    if np.quantile(rate, 0.9) > FASTEST_YAW:  # of a car that spins, where the course tells little
+        at = float(begins[np.argmax(rate > FASTEST_YAW)])
+        message = f"heading_rad turns at over {FASTEST_YAW:g} rad/s: in degrees?"
+        raise InputError(f"{file}, {at:.2f} s: {message}")
     middle = begins + over / 2
     if "yaw_rate_radps" in truth:
         rate = np.interp(middle, truth["time_s"], truth["yaw_rate_radps"])

@@ -22,7 +22,9 @@ LOGS = {  # a log, and the parameters that show in it
     "long slides: full throttle at full lock, held and then let go, with motion capture": (
         "tires.*.sliding_ratio",
         "tires.*.longitudinal_ratio",
+        "body.front_roll_share",
     ),
+    "any of these again, with battery_charge in its run.toml": ("battery.charge",),
     "quick changes of steering from side to side below the limit of grip, yaw rate at 50 Hz or "
     "more": ("body.yaw_inertia",),
     "steps of throttle up and down, logged at 50 Hz or more": ("motor.delay", "motor.lag"),

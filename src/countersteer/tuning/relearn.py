@@ -17,6 +17,8 @@ from those that a car was fitted to, both taken from the old runs alone. These a
   long as k pieces, the excess has the standard deviation s sqrt(1/k + 1/PIECES); Student's t with
   PIECES - 1 degrees of freedom gives how many of these chance reaches once in a hundred.
 
+And it must be worth while: beyond `LEAST` at any rate.
+
 Source of the loop: P. Abbeel, A. Coates, M. Quigley, A. Y. Ng, An application of reinforcement
 learning to aerobatic helicopter flight, NIPS 2006.
 """
@@ -37,6 +39,7 @@ from countersteer.tuning.tune import Logs
 FAINT = 0.2  # normalised error that counts as none: a fifth of what a good fit is off by
 PIECES = 8  # of the old runs, in the order of their time
 CHANCE = 0.01  # of calling for a driver where nothing has changed
+LEAST = 1.1  # factor of the error up to which no one learns a driver again
 PASSES = 12  # evaluations of the fit to a half
 KINDS = (fit.straight, fit.steered, fit.slides)  # a later one takes precedence
 
@@ -44,8 +47,7 @@ KINDS = (fit.straight, fit.steered, fit.slides)  # a later one takes precedence
 def window_errors(cars: Mapping[str, Car], shots: Shots) -> np.ndarray:
     """Give e, as above, of each window."""
     problem = fit.Problem(dict(cars), shots, ())
-    table = problem.table[shots.surface]
-    found = fit.in_lanes(fit.predicted, problem.base, table, shots)
+    found = problem.predictions()
     off = np.where(problem.known, (found - shots.measured) / fit.SCALES[:, None], 0.0)
     # A prediction that came to nothing is a bad one, not an absent one.
     squares = np.sum(np.nan_to_num(off, nan=1e2) ** 2, axis=(1, 2))
@@ -72,7 +74,7 @@ def optimism(cars: dict[str, Car], shots: Shots, piece: np.ndarray, free: tuple[
     cars_of = []
     for half in (0, 1):
         problem = fit.Problem(cars, fit.taken(shots, piece % 2 == half), free)
-        cars_of.append(problem.cars_at(problem.solve(problem.prior, PASSES).x))
+        cars_of.append(problem.cars_at(problem.solve(problem.start, PASSES).x))
     errors = np.stack([window_errors(found, shots) for found in cars_of])
     own = np.arange(len(piece)), piece % 2
     other = np.arange(len(piece)), 1 - piece % 2
@@ -93,13 +95,15 @@ def judge(
     Errors are exp of the mean e: 1 is what a good fit is off by. `learn_again` is whether
     `excess`, the factor by which the new runs' exceeds the old ones', is beyond `threshold`;
     `gain` is the part of the new runs' error that the refit took away in those of their windows
-    held out of it (`hold_out`, as in `tune.tune`), or else in all.
+    held out of it (`hold_out`, as in `tune.tune`), or else in all. A battery that a log does not
+    tell of is as full as agrees best with the car before: that it ran down is no fault of the car.
     """
     if len(old.start) < 2 * PIECES:
         raise InputError(
             f"--new: the old runs hold {len(old.start)} windows, of the {2 * PIECES} at least "
             "that tell what is usual"
         )
+    old, new = (logs.charged(fit.estimated_charge(before, logs.shots)) for logs in (old, new))
     report(f"the car before, on {len(old.start)} old and {len(new.start)} new windows")
     on_old, on_new = (window_errors(before, logs.shots) for logs in (old, new))
     kind_old, kind_new = kinds(old.shots), kinds(new.shots)
@@ -119,14 +123,15 @@ def judge(
     chosen = fit.STAGES[what].chooses(old.shots)
     report("cars of either half of the old runs, for what a car errs more on runs it has not seen")
     unseen = optimism(before, old.where(chosen).shots, piece[chosen], fit.STAGES[what].parameters)
-    judged = fit.blocks(new.start) == 2 if hold_out else np.full(len(new.start), True)
+    judged = fit.blocks(new.start, new.run) == 2 if hold_out else np.full(len(new.start), True)
     hold_out = hold_out and bool(judged.any())
     judged |= not hold_out
     refitted = window_errors(after, fit.taken(new.shots, judged))
+    usually = max(unseen + chance, math.log(LEAST))
     found: dict[str, Any] = {
-        "learn_again": beyond > unseen + chance,
+        "learn_again": beyond > usually,
         "excess": math.exp(beyond),
-        "threshold": math.exp(unseen + chance),
+        "threshold": math.exp(usually),
         "optimism": math.exp(unseen),
         "by_chance": math.exp(chance),
         "old": {"windows": len(on_old), "error": math.exp(on_old.mean())},

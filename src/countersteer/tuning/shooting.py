@@ -5,6 +5,7 @@ depends on the car by JAX: where the servo and the speed controller stand at its
 wheels turn at, and the motion to its end. So residuals have exact derivatives.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -38,12 +39,13 @@ SAMPLE = 0.05  # s between the instants at which motions are compared
 class Shots(NamedTuple):
     """Windows of logs; every leaf has a leading axis of windows. SI units."""
 
+    run: Array  # index of the log
     surface: Array  # index of the surface
     velocity: Vector  # at the start, of the centre of mass in the body's axes
     acceleration: tuple[Array, Array]  # that the loads follow, forward and left
     wheel_speed: Array  # mean rim speed; NaN: wheels roll
     rims: Wheels  # rim speeds; NaN: not known one by one
-    charge: Array
+    charge: Array  # of the battery; NaN: the log does not tell
     throttle: Array  # (windows, ticks from `BEFORE` on), asked for
     steering: Array
     measured: Array  # (windows, quantities, samples after the start); NaN: not known
@@ -55,9 +57,9 @@ def joined(parts: Sequence[Shots]) -> Shots:
 
 
 def take(
-    run: Run, car: Car, surface: int, horizon: float, every: float, dt: float
+    run: Run, car: Car, number: int, surface: int, horizon: float, every: float, dt: float
 ) -> tuple[Shots, np.ndarray] | None:
-    """The windows of a run, `every` seconds, and when they start; None where there are none.
+    """The windows of the run of this number, `every` seconds, and when they start; None if none.
 
     They are those that `replay --compare` judges by; the car serves for what is known of it: its
     radii, and which quantities its readings are.
@@ -94,12 +96,13 @@ def take(
     before = round(BEFORE / dt)
     throttle, steering = asked(run.commands, starts[:, None] + np.arange(-before, ticks + 1), dt)
     shots = Shots(
+        np.full(len(starts), number),
         np.full(len(starts), surface),
         Vector(vx, vy, yaw_rate),
         (ax, ay),
         mean,
         rims,
-        np.full(len(starts), float(run.about.get("battery_charge", 1.0))),
+        np.full(len(starts), float(run.about.get("battery_charge", math.nan))),
         throttle,
         steering,
         np.stack(seen, axis=1),
@@ -111,7 +114,7 @@ def take(
 
 
 def predict(car: Car, shot: Shots, dt: float) -> Array:
-    """What the car would do in one window: (quantities, samples)."""
+    """What the car would do in one window, whose charge is known: (quantities, samples)."""
     samples = shot.measured.shape[-1]
     every = round(SAMPLE / dt)
     before = round(BEFORE / dt)

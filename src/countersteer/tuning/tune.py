@@ -23,26 +23,34 @@ EVERY = {"fitted": 0.5, "judged": 0.25}  # s between the starts of windows
 
 
 class Logs(NamedTuple):
-    """Windows of runs, with the run and the time of each."""
+    """Windows of runs, with the time of each."""
 
     runs: list[Run]
     masked: list[str]  # what was left out or mended, in words
     shots: Shots
-    run: np.ndarray
     start: np.ndarray
+
+    @property
+    def run(self) -> np.ndarray:
+        """The index of each window's run."""
+        return np.asarray(self.shots.run)
 
     def where(self, chosen: np.ndarray) -> "Logs":
         """Some of the windows."""
         shots = fit.taken(self.shots, chosen)
-        return self._replace(shots=shots, run=self.run[chosen], start=self.start[chosen])
+        return self._replace(shots=shots, start=self.start[chosen])
+
+    def charged(self, charge: np.ndarray) -> "Logs":
+        """With it known how full the battery was in each run."""
+        return self._replace(shots=fit.charged(self.shots, charge))
 
     def joined(self, other: "Logs") -> "Logs":
         """With the windows of other runs after these."""
+        after = other.shots._replace(run=other.run + len(self.runs))
         return Logs(
             self.runs + other.runs,
             self.masked + other.masked,
-            shooting.joined([self.shots, other.shots]),
-            np.concatenate([self.run, other.run + len(self.runs)]),
+            shooting.joined([self.shots, after]),
             np.concatenate([self.start, other.start]),
         )
 
@@ -61,8 +69,8 @@ def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: 
         masks.append(found)
         words += [f"{run.path.name}: {line}" for line in said] + [_said(run, f) for f in found]
     surfaces = [surface_of(run, cars, base) for run in clean]
-    shots, of_run, start = fit.take_shots(clean, dict(cars), surfaces, masks, every)
-    return Logs(clean, words, shots, of_run, start)
+    shots, start = fit.take_shots(clean, dict(cars), surfaces, masks, every)
+    return Logs(clean, words, shots, start)
 
 
 def _said(run: Run, fault: Fault) -> str:
@@ -100,15 +108,19 @@ def tune(
     began = time.monotonic()
     parts = [("fitted", logs)]
     if hold_out:
-        kind = fit.blocks(logs.start)
+        kind = fit.blocks(logs.start, logs.run)
         if not ((kind == 1).any() and (kind == 2).any()):
             raise InputError("too little data to hold a part out: give --validate, or --hold-out 0")
         parts = [("fitted", logs.where(kind == 1)), ("held out", logs.where(kind == 2))]
-    if validation is not None:
-        parts.append(("validation", validation))
     fitted = parts[0][1]
     thin = fitted.where(thinned(fitted.start, EVERY["fitted"]))
-    result = fit.fit(cars, thin.shots, what, thin.run, report)
+    result = fit.fit(cars, thin.shots, what, report)
+    # What no log tells is taken from the windows that were fitted; of other logs from their own.
+    charge = fit.estimated_charge(result.cars, thin.shots)
+    parts = [(title, part.charged(charge)) for title, part in parts]
+    if validation is not None:
+        charge = fit.estimated_charge(result.cars, validation.shots)
+        parts.append(("validation", validation.charged(charge)))
     runs: list[dict[str, Any]] = []
     totals: dict[str, Any] = {}
     for title, part in parts:
@@ -122,13 +134,19 @@ def tune(
             if chosen.any():
                 shots = part.where(chosen).shots
                 surface = list(cars)[int(shots.surface[0])]
-                entry = {"run": run.path.name, "surface": surface, "kind": title}
+                entry = {
+                    "run": run.path.name,
+                    "surface": surface,
+                    "kind": title,
+                    "battery_charge": float(shots.charge[0]),
+                    "battery_told": "battery_charge" in run.about,
+                }
                 runs.append(entry | judged(result.cars, shots))
     about: dict[str, Any] = {
         "fit": what,
         "seconds": round(time.monotonic() - began, 1),
         "surfaces": list(cars),
-        "parameters": [told(one) for one in result.fitted],
+        "parameters": [told(one, logs.runs) for one in result.fitted],
         "not_determined": sorted({f.path for f in result.fitted if not f.determined}),
         "at_bounds": sorted({f.path for f in result.fitted if f.at_bound}),
         "runs": runs,
@@ -172,13 +190,14 @@ def judged(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
     return whole
 
 
-def told(one: Fitted) -> dict[str, Any]:
+def told(one: Fitted, runs: Sequence[Run]) -> dict[str, Any]:
     """A fitted parameter in the units of files."""
     declared = fit.declaration(one.path)
     suffix, factor = EDGE[declared.unit]
     return {
         "path": one.path,
         "surface": one.surface,
+        "run": None if one.run is None else runs[one.run].path.name,
         "unit": suffix.lstrip("_"),
         "prior": one.before / factor,
         "value": one.value / factor,
@@ -194,9 +213,7 @@ def series(cars: dict[str, Car], parts: Sequence[tuple[str, Logs]]) -> list[dict
     """What a page draws: each run as measured, with the windows simulated in it."""
     drawn: dict[str, dict[str, Any]] = {}
     for kind, part in parts:
-        problem = fit.Problem(cars, part.shots, ())
-        table = problem.table[part.shots.surface]
-        found = fit.in_lanes(fit.predicted, problem.base, table, part.shots)
+        found = fit.Problem(cars, part.shots, ()).predictions()
         steps = shooting.SAMPLE * np.arange(1, part.shots.measured.shape[-1] + 1)
         for i, run in enumerate(part.runs):
             rows = np.flatnonzero(part.run == i)
@@ -242,8 +259,7 @@ def series(cars: dict[str, Car], parts: Sequence[tuple[str, Logs]]) -> list[dict
 
 def residuals(cars: dict[str, Car], logs: Logs, most: int = 3000) -> dict[str, Any]:
     """Normalised residuals by quantity, at most so many of each."""
-    problem = fit.Problem(cars, logs.shots, ())
-    found = fit.in_lanes(fit.predicted, problem.base, problem.table[logs.shots.surface], logs.shots)
+    found = fit.Problem(cars, logs.shots, ()).predictions()
     result = {}
     for i, quantity in enumerate(QUANTITIES):
         off = ((found - logs.shots.measured)[:, i] / fit.SCALES[i]).ravel()
@@ -306,7 +322,8 @@ def table_lines(about: dict[str, Any]) -> list[str]:
         flag = "" if one["determined"] else "  not determined: left"
         flag += "  at its bound" if one["at_bound"] else ""
         unit = f"_{one['unit']}" if one["unit"] else ""
-        name = one["path"] + unit + (f" ({one['surface']})" if one["surface"] else "")
+        where = one["surface"] or one["run"]
+        name = one["path"] + unit + (f" ({where})" if where else "")
         change = f"{one['prior']:10.4g} -> {one['value']:10.4g} ± {one['deviation']:.2g}"
         lines.append(f"  {name:52} {change}{flag}")
     return lines

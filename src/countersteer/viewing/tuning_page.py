@@ -225,8 +225,8 @@ def _correlations(result: Mapping[str, Any]) -> str:
 
 
 def _named(parameter: Mapping[str, Any]) -> str:
-    surface = parameter["surface"]
-    return f"{parameter['path']} ({surface})" if surface else str(parameter["path"])
+    where = parameter["surface"] or parameter.get("run")
+    return f"{parameter['path']} ({where})" if where else str(parameter["path"])
 
 
 # -------------------------------------------------------------------------------------------------
@@ -301,7 +301,8 @@ def _parameters(parameters: Iterable[Mapping[str, Any]]) -> str:
         times = f"×10<sup>{_fixed(power, 0)}</sup> " if power else ""
         declared = _declaration(p["path"])
         meaning = f'<small class="meaning">{escape(declared.meaning)}</small>' if declared else ""
-        surface = f"<small>{escape(p['surface'])}</small>" if p["surface"] else ""
+        where = p["surface"] or p.get("run")
+        surface = f"<small>{escape(where)}</small>" if where else ""
         path = re.sub(r"([._])", r"\1<wbr>", escape(p["path"]))
         flags = ("" if p["determined"] else ' <span class="flag warn">not determined</span>') + (
             ' <span class="flag bad">at a bound</span>' if p["at_bound"] else ""
