@@ -118,14 +118,13 @@ def peak_friction(tire: Tire) -> float:
 
 def drag_of_turning(car: Car, across: Array) -> np.ndarray:
     """What brush tyres lose to their slip angles at this lateral acceleration (m/s²)."""
-    lost = np.zeros_like(across)
     behind = (car.body.wheelbase - car.body.front_axle) / car.body.wheelbase
+    lost = []
     for tire, load in ((car.tires.front, behind), (car.tires.rear, 1 - behind)):
         part = np.clip(across / GRAVITY / tire.friction, 0.0, 1.0)
-        slides = 1 - np.cbrt(1 - part)
-        slip = 3 * tire.friction * slides / tire.cornering_stiffness
-        lost = lost + load * across * slip
-    return lost
+        slip = 3 * tire.friction * (1 - np.cbrt(1 - part)) / tire.cornering_stiffness
+        lost.append(load * across * slip)
+    return np.asarray(sum(lost))
 
 
 def profile(
@@ -153,7 +152,7 @@ def profile(
     v = np.minimum(np.sqrt(grip / np.maximum(curvature, 1e-6)), top)
     left = lambda i: ratio * np.sqrt(max(0.0, grip**2 - (v[i] ** 2 * curvature[i]) ** 2))  # noqa: E731  # used twice
     for i in [*range(POINTS)] * 2:  # twice round, as the lap has no beginning
-        turning = float(drag_of_turning(car, v[i - 1] ** 2 * curvature[i - 1]))
+        turning = drag_of_turning(car, v[i - 1] ** 2 * curvature[i - 1])
         gain = min(np.interp(v[i - 1], speeds, full) - turning, left(i - 1))
         v[i] = min(v[i], np.sqrt(max(0.0, v[i - 1] ** 2 + 2 * spacing * gain)))
     for i in [*reversed(range(POINTS))] * 2:
@@ -161,9 +160,9 @@ def profile(
         v[i - 1] = min(v[i - 1], np.sqrt(v[i] ** 2 + 2 * spacing * loss))
     wanted = (np.roll(v, -1) ** 2 - v**2) / (2 * spacing)
     back_emf = float(car.motor.torque_constant * car.drivetrain.gear_ratio) * v / radius
-    turning = drag_of_turning(car, v**2 * curvature)
-    over = wanted + turning - np.interp(v, speeds, rolls)
-    needed = (wanted + turning + np.interp(v, speeds, np.asarray(resists))) * mass * radius
+    resisted = drag_of_turning(car, v**2 * curvature)
+    over = wanted + resisted - np.interp(v, speeds, rolls)
+    needed = (wanted + resisted + np.interp(v, speeds, np.asarray(resists))) * mass * radius
     volts = back_emf + needed * float(
         car.motor.resistance
         / (car.motor.torque_constant * car.drivetrain.gear_ratio * car.drivetrain.efficiency)

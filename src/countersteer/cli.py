@@ -767,6 +767,10 @@ def run_tune(options: argparse.Namespace) -> int:
 
     if options.out.suffix != ".toml":
         raise InputError(f"--out {options.out}: name a .toml file")
+    try:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {options.out}: {error.strerror}") from None
     keep_programs(blocks=True)
     runs = [read_run(path) for path in options.runs]
     car, base = load_car(options.car), Path(options.car).stem
