@@ -21,7 +21,7 @@ check: $(READY)
 accuracy: $(READY)
 	$(BIN)/python -m countersteer.evaluation.accuracy docs/accuracy.md
 
-# Twenty fits: an hour or more on two cores.
+# Twenty fits: ten minutes or more on two cores.
 recovery: $(READY)
 	$(BIN)/python -m countersteer.evaluation.recovery docs/recovery.md
 

@@ -9,9 +9,9 @@ from countersteer.evaluation.recovery import Case
 from countersteer.tuning import fit
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_what_is_determined_of_a_known_car_lies_within_three_deviations(seed):
-    cases = recovery.recovered(seed, "handling")
+@pytest.mark.parametrize(("seed", "what"), [(0, "handling"), (1, "all")])
+def test_what_is_determined_of_a_known_car_lies_within_three_deviations(seed, what):
+    cases = recovery.recovered(seed, what)
     determined = [case for case in cases if case.determined]
     assert len(determined) >= 4
     for case in determined:

@@ -14,10 +14,12 @@ from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
 from countersteer.cli import main
 from countersteer.errors import InputError
+from countersteer.evaluation import folds
 from countersteer.evaluation.compare import compare
 from countersteer.runs.files import COMMANDS, TableWriter, command_rows
 from countersteer.runs.run import Run, read_run
 from countersteer.tuning import fit, shooting, tune
+from countersteer.tuning.shooting import Shots
 
 TRUE = {
     "tires.front.friction": 0.45,
@@ -247,6 +249,56 @@ def test_the_command_writes_a_car_a_page_and_figures(logs, tmp_path, capsys):
     assert held["persistence"]["vx_mps"]["median_abs_error"] > 0
     assert Path(told["page"]).exists()
     assert any(one["path"] == "body.yaw_inertia" for one in told["parameters"])
+
+
+def test_cars_of_other_floors_stand_beside_the_base_or_in_the_library(tmp_path):
+    base = tmp_path / "mine.toml"
+    base.write_text('base = "jetracer"\n')
+    (tmp_path / "kitchen.toml").write_text('base = "mine.toml"\n[tires.front]\nfriction = 0.6\n')
+    found = tune.other_floors(str(base), {"kitchen", "jetracer-tape", "nowhere"})
+    assert list(found) == ["jetracer-tape", "kitchen"]
+    assert found["kitchen"].tires.front.friction == 0.6
+    assert found["jetracer-tape"] == load_car("jetracer-tape")
+    assert list(tune.other_floors("jetracer", {"kitchen", "jetracer-tape"})) == ["jetracer-tape"]
+
+
+def test_each_window_and_each_brief_log_is_left_out_once():
+    start = np.concatenate([np.arange(0, 30, 0.25), *[np.arange(0, 5, 0.25)] * 4])
+    run = np.repeat(np.arange(5), [120, 20, 20, 20, 20])
+    shots = Shots(run, *[0 * run] * (len(Shots._fields) - 1))
+    logs = tune.Logs([], [], shots, start)
+    kind = np.stack([folds.kinds(logs, fold) for fold in range(folds.FOLDS)])
+    assert np.all(np.sum(kind == 2, axis=0)[run > 0] == 1)
+    assert np.all(np.sum(kind == 2, axis=0) <= 1)
+    assert np.mean(np.sum(kind == 2, axis=0)[run == 0]) == pytest.approx(0.5)
+    for fold in range(folds.FOLDS):
+        for log in range(1, 5):
+            assert len(set(kind[fold, run == log])) == 1
+        held, fitted = (
+            {
+                round(float(t), 2)
+                for s in start[(kind[fold] == which) & (run == 0)]
+                for t in (s, s + 1)
+            }
+            for which in (2, 1)
+        )
+        assert held
+        assert not held & fitted
+
+
+def test_errors_are_pooled_by_log(logs, windows):
+    _, cars = logs
+    found = folds.judged(cars, windows)
+    assert sorted(found) == [0, 1, 2]
+    whole = fit.errors(cars, windows.shots)
+    for kind, name in (("simulated", "simulated"), ("unchanged", "persistence")):
+        off = np.concatenate([getattr(found[run], kind) for run in range(3)])
+        medians = np.nanmedian(off, axis=0)
+        told = [whole[name][quantity]["median_abs_error"] for quantity in fit.QUANTITIES]
+        np.testing.assert_allclose(medians, told)
+    page = folds.page(windows, found, {0: 0.1234}, "base.toml")
+    assert "| 0.123 |" in page
+    assert "– where something changes" in page
 
 
 def test_no_window_is_one_line(tmp_path, capsys):

@@ -761,9 +761,10 @@ def run_import(options: argparse.Namespace) -> int:
 
 def run_tune(options: argparse.Namespace) -> int:
     """`tune`."""
-    from countersteer.car.files import library, load_car
+    from countersteer.car.files import load_car
     from countersteer.runs.run import read_run
     from countersteer.simulator import keep_programs
+    from countersteer.tuning.tune import other_floors
 
     if options.out.suffix != ".toml":
         raise InputError(f"--out {options.out}: name a .toml file")
@@ -781,7 +782,7 @@ def run_tune(options: argparse.Namespace) -> int:
     validation = [read_run(path) for path in options.validate]
     new = [read_run(path) for path in options.new]
     named = {str(run.about.get("car_name", base)) for run in (*runs, *validation, *new)}
-    others = {name: load_car(name) for name in sorted(named & set(library()) - {base})}
+    others = other_floors(options.car, named - {base})
     return tune_all(options, runs, validation, new, base, car, others)
 
 

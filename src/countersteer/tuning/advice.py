@@ -77,7 +77,7 @@ def next_log(parameters: Sequence[Mapping[str, Any]]) -> str:
     lines = []
     for (log, surface), tells in list(wanted.items())[:MOST]:
         where = f"on {surface}: " if surface else ""
-        paths = ", ".join(parameter["path"] for parameter in tells)
+        paths = ", ".join(dict.fromkeys(parameter["path"] for parameter in tells))
         said = f"{where}{log}"
         lines.append(f"{said[0].upper()}{said[1:]} (for {paths}).")
     return "\n".join(lines)

@@ -247,17 +247,22 @@ def without(shots: Shots, column: str, where: np.ndarray) -> Shots:
     return shots._replace(measured=measured)
 
 
-def blocks(time: np.ndarray, run: np.ndarray) -> np.ndarray:
+def blocks(time: np.ndarray, run: np.ndarray, fold: int = 2) -> np.ndarray:
     """Of windows of logs, by their start: 1 for those to fit, 2 for those held out, else 0.
 
-    Blocks of `HELD_OUT` seconds take turns, two to fit and one to hold out; a window that reaches
-    from one kind into the other belongs to neither. Beside longer logs, one whose windows lie
-    within `BRIEF` seconds is fitted whole: it is a manoeuvre, and its parts are unlike.
+    Blocks of `HELD_OUT` seconds take turns, two to fit and one (`fold` of 0 to 2) to hold out; a
+    window that reaches from one kind into the other belongs to neither. Beside longer logs, one
+    that is `brief` is fitted whole: it is a manoeuvre, and its parts are unlike.
     """
-    held = [np.floor((time + lead) / HELD_OUT) % 3 == 2 for lead in (0.0, HORIZON)]
+    held = [np.floor((time + lead) / HELD_OUT) % 3 == fold for lead in (0.0, HORIZON)]
     kind = np.where(held[0] & held[1], 2, np.where(held[0] | held[1], 0, 1))
-    brief = np.array([np.ptp(time[run == k]) < BRIEF for k in run])
-    return kind if brief.all() else np.where(brief, 1, kind)
+    whole = brief(time, run)
+    return kind if whole.all() else np.where(whole, 1, kind)
+
+
+def brief(time: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Whether a window is of a log whose windows lie within `BRIEF` seconds."""
+    return np.array([np.ptp(time[run == k]) < BRIEF for k in run])
 
 
 class Solved(NamedTuple):

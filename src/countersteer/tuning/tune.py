@@ -1,7 +1,7 @@
 """`tune`: runs in, a car and what it is worth out."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +9,7 @@ import numpy as np
 import tomli_w
 
 from countersteer.car.car import Car
-from countersteer.car.files import save_car
+from countersteer.car.files import library, load_car, save_car
 from countersteer.car.parameter import EDGE, changed
 from countersteer.errors import InputError
 from countersteer.runs.faults import Fault, faults, refuse, repaired
@@ -81,6 +81,17 @@ def surface_of(run: Run, cars: Mapping[str, Car], base: str) -> str:
     """The surface that a run was driven on: the car that its `run.toml` names, or the base."""
     name = str(run.about.get("car_name", base))
     return name if name in cars else base
+
+
+def other_floors(base: str, named: Iterable[str]) -> dict[str, Car]:
+    """The cars that logs name: from beside a base that is a file, or else of the library.
+
+    A name that is neither is not among them: such a log counts as of the base's own floor.
+    """
+    where = {name: name for name in library()}
+    if Path(base).suffix == ".toml":
+        where |= {path.stem: str(path) for path in Path(base).parent.glob("*.toml")}
+    return {name: load_car(where[name]) for name in sorted(set(named) & set(where))}
 
 
 def by_surface(base: str, car: Car, others: Mapping[str, Car]) -> dict[str, Car]:
