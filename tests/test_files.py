@@ -497,3 +497,11 @@ def test_rounded_corners_join_their_straights_on_one_circle(tmp_path):
         ends = course.walls[:half, :2] if side > 0 else course.walls[half:, :2]
         away = np.hypot(*(ends[:, None] - centres[None]).transpose(2, 0, 1)).min(axis=1)
         np.testing.assert_allclose(away, radius, rtol=5e-3)  # chords of 5°, mitred
+
+
+def test_the_cars_of_the_examples_load():
+    paths = sorted((Path(__file__).parents[1] / "examples" / "dart").glob("*.toml"))
+    assert len(paths) == 3
+    cars = [load_car(str(path)) for path in paths]
+    assert len({car.tires.front.friction for car in cars}) == 3
+    assert len({car.body.mass for car in cars}) == 1
