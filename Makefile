@@ -21,7 +21,7 @@ check: $(READY)
 accuracy: $(READY)
 	$(BIN)/python -m countersteer.evaluation.accuracy docs/accuracy.md
 
-# Twenty fits: ten minutes or more on two cores.
+# Twenty fits: six minutes or more on two cores.
 recovery: $(READY)
 	$(BIN)/python -m countersteer.evaluation.recovery docs/recovery.md
 

@@ -1,5 +1,7 @@
 """The study of known cars found again: its logs, its page, and one car of it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -16,8 +18,9 @@ def test_what_is_determined_of_a_known_car_lies_within_three_deviations(seed, wh
     assert len(determined) >= 4
     for case in determined:
         assert case.off < 3, (seed, case)
-    moved = [case.found != fit.value_of(load_car(recovery.BASE), case.path) for case in determined]
-    assert sum(moved) >= 4
+        declared = fit.declaration(case.path)
+        before = fit.value_of(load_car(recovery.BASE), case.path)
+        assert case.found != before or before in (declared.low, declared.high), (seed, case)
 
 
 def test_a_random_car_differs_in_everything_and_keeps_its_ranges():
@@ -29,8 +32,8 @@ def test_a_random_car_differs_in_everything_and_keeps_its_ranges():
             assert declared.low <= value <= declared.high, (seed, path)
     free = ("body.yaw_inertia", "motor.torque_constant", "servo.trim")
     assert all(fit.value_of(car, path) != fit.value_of(base, path) for path in free)
-    kept = ("mass", "wheelbase", "track", "cm_height")
-    assert all(getattr(car.body, name) == getattr(base.body, name) for name in kept)
+    freed = {"yaw_inertia": base.body.yaw_inertia, "front_roll_share": base.body.front_roll_share}
+    assert dataclasses.replace(car.body, **freed) == base.body
 
 
 def test_the_page_counts_what_is_within_how_many_deviations():

@@ -114,7 +114,7 @@ def compare(
             f"{run.path}: no window of {ticks * dt:g} s has a whole reference: motion capture, or "
             "wheel_speed_mps and gyro_radps in telemetry.csv"
         )
-    charge, as_if_full = run.about["battery_charge"], {}
+    charge, as_if_full = float(run.about["battery_charge"]), {}
     if not told:
         as_if_full = {"as_if_full": scores(windows)}
         charge = agreeing_charge(run, car, measured, dt)

@@ -44,7 +44,7 @@ OUTLYING = 0.2  # normalised residual at which the loss turns linear
 GROSS = 0.5  # square of a residual beyond which it tells no more of the noise
 WILD = 1e3  # change of a residual per width of a parameter, from which nothing is linear
 TOLERANCE = 1e-5
-PASSES = 40  # evaluations of a stage, at most
+PASSES = 40  # steps of a search, at most
 DAMPING, EASY, STUCK = 0.01, 1e-6, 1e4  # of a step: at first, at the least, and in vain
 KNOWN = 0.9  # part of the prior's width under which a parameter counts as determined
 STRAIGHT = math.radians(4)  # steering under which a window is straight
@@ -182,7 +182,6 @@ class Result(NamedTuple):
     """A fit and what it is worth."""
 
     cars: dict[str, Car]  # by surface
-    charge: np.ndarray  # by log
     fitted: list[Fitted]
     cost: float
     evaluations: int
@@ -271,7 +270,6 @@ class Solved(NamedTuple):
     x: np.ndarray
     cost: float
     fun: np.ndarray  # residuals
-    jac: np.ndarray  # their derivatives, so weighted that jacᵀ jac is the cost's curvature
     nfev: int
 
 
@@ -299,6 +297,8 @@ class Problem:
         """
         self.cars = cars
         self.shots = shots
+        self.surface = np.zeros(int(shots.run.max()) + 1, int)  # by log
+        self.surface[shots.run] = shots.surface
         surfaces = [int(k) for k in np.unique(shots.surface)]
         untold = [int(k) for k in np.unique(shots.run[np.isnan(shots.charge)])]
         self.parameters = []
@@ -338,14 +338,12 @@ class Problem:
 
     def tabled(self, cars: dict[str, Car], charge: np.ndarray | None = None) -> np.ndarray:
         """The values of `TABLE` in each log: (logs, `TABLE`)."""
-        count = int(self.shots.run.max()) + 1
-        filled = np.full(count, FULL) if charge is None else charge[:count].copy()
-        surface, told = np.zeros(count, int), np.full(count, math.nan)
-        surface[self.shots.run] = self.shots.surface
-        told[self.shots.run] = self.shots.charge
+        logs = len(self.surface)
+        known = np.full(logs, FULL) if charge is None else charge[:logs].copy()
+        tells = np.isfinite(self.shots.charge)
+        known[self.shots.run[tells]] = self.shots.charge[tells]
         of_car = np.array([[value_of(car, path) for path in PARAMETERS] for car in cars.values()])
-        self.surface = surface
-        return np.column_stack([of_car[surface], np.where(np.isnan(told), filled, told)])
+        return np.column_stack([of_car[self.surface], known])
 
     def moves(self, parameter: Parameter) -> np.ndarray:
         """The logs that a parameter is of."""
@@ -370,8 +368,7 @@ class Problem:
 
     def predictions(self, u: Array = ()) -> np.ndarray:
         """What is simulated: (windows, quantities, samples)."""
-        table = self.filled(u) if len(self.parameters) else self.table
-        return in_lanes(predicted, self.base, table[self.shots.run], self.shots)
+        return in_lanes(predicted, self.base, self.filled(u)[self.shots.run], self.shots)
 
     def residuals(self, u: Array) -> np.ndarray:
         """All residuals, those of the prior last."""
@@ -442,9 +439,7 @@ class Problem:
             u, fun, damping = there, found, max(damping / 3, EASY)
             if before - loss(fun)[0].sum() < TOLERANCE * before:
                 break
-        cost, _, bend = loss(fun)
-        curved = np.sqrt(bend)[:, None] * self.jacobian(u)
-        return Solved(u, float(cost.sum()), fun, curved, evaluations)
+        return Solved(u, float(loss(fun)[0].sum()), fun, evaluations)
 
     def cars_at(self, u: Array) -> dict[str, Car]:
         """The cars by surface; each keeps what is not fitted of its own."""
@@ -612,13 +607,7 @@ def believed(
         )
         for i, p in enumerate(problem.parameters)
     ]
-    return Result(
-        problem.cars_at(solved.x),
-        problem.charge_at(solved.x),
-        fitted,
-        float(solved.cost),
-        evaluations,
-    )
+    return Result(problem.cars_at(solved.x), fitted, solved.cost, evaluations)
 
 
 class Held(Problem):
@@ -644,7 +633,8 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
     """
     count = len(problem.parameters)
     observations = max(1, int(problem.known[:, :, -1].sum()))
-    data, expected = solved.jac[:-count], solved.jac[-count:]
+    curved = np.sqrt(loss(solved.fun)[2])[:, None] * problem.jacobian(solved.x)
+    data, expected = curved[:-count], curved[-count:]
     noise = max(1.0, float(np.sum(np.minimum(solved.fun[:-count] ** 2, GROSS)) / observations))
     information = data.T @ data / noise + expected.T @ expected
     left = list(range(count))

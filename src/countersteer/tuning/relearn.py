@@ -40,7 +40,7 @@ FAINT = 0.2  # normalised error that counts as none: a fifth of what a good fit 
 PIECES = 8  # of the old runs, in the order of their time
 CHANCE = 0.01  # of calling for a driver where nothing has changed
 LEAST = 1.1  # factor of the error up to which no one learns a driver again
-PASSES = 12  # evaluations of the fit to a half
+PASSES = 12  # steps of the fit to a half, at most
 KINDS = (fit.straight, fit.steered, fit.slides)  # a later one takes precedence
 
 
