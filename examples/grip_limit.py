@@ -1,6 +1,6 @@
 """A driver of one's own that laps closed courses at the limit of grip, without drifting.
 
-It steers by the true state (`estimate="truth"`), not by sensors: a yardstick, not a robot. Try
+It steers by the true state (the estimator `truth`), not by sensors: a yardstick, not a robot. Try
 
     python examples/grip_limit.py TRACK.csv --laps 2
 """
@@ -15,11 +15,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from countersteer.car.car import GRAVITY, Car, Tire
 from countersteer.car.files import load_car
-from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.car.parameter import pytree
 from countersteer.course.course import Course, progress
 from countersteer.course.files import load_course
-from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.driver import Observation
 from countersteer.errors import InputError
+from countersteer.pilot import Pilot
+from countersteer.signals import Array, Command, Scalar
 from countersteer.simulator import Simulator, keep_programs
 from countersteer.world import motor
 
@@ -174,10 +176,10 @@ def profile(
 def lap_times(course: Course, car: Car, laps: int, share: float = 0.85) -> tuple[list[float], int]:
     """Drives so many laps, or as far as it gets; the time of each, and how often walls were hit."""
     driver = grip_limit(course, car, share)
-    simulator = Simulator(course, car, driver, estimate="truth")
+    simulator, pilot = Simulator.of(course, car), Pilot.of(driver, course, car, "truth")
     longest = 20.0 + 2 * laps * float(np.sum(driver.spacing / driver.speed))
     distance, contacts, ends = course.start_distance, 0, [0.0]
-    for record in simulator.run(longest):
+    for record in simulator.run(pilot, longest):
         every = slice(9, None, 10)
         along = progress(course, record.motion.x[every], record.motion.y[every], distance)
         distance, contacts = float(along[-1]), int(record.wall_contacts[-1])

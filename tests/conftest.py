@@ -15,11 +15,16 @@ from countersteer.course.course import Course
 from countersteer.drivers.replay import Replay
 from countersteer.evaluation.drive import about_run
 from countersteer.evaluation.drive import drive as write_drive
+from countersteer.link.link import ONBOARD, Link
+from countersteer.pilot import Pilot
 from countersteer.runs.run import Run, read_run
-from countersteer.simulator import Simulator, keep_programs
+from countersteer.signals import Motion
+from countersteer.simulator import Record, Simulator, keep_programs
+from countersteer.task import turns
+from countersteer.task.task import PERIOD, Sample, Score, Task
 from countersteer.world import planar
 from countersteer.world.floor import Floor
-from countersteer.world.state import Motion, State
+from countersteer.world.state import State
 
 LANES = 32  # cars in a batch: always as many, so that there is one program
 PIECE = 100  # ticks that a call of it takes
@@ -171,9 +176,41 @@ def step_run(
     driver = Replay(
         times=np.array([0.0, seconds]), throttle=np.array([level, 0.0]), steering=np.zeros(2)
     )
-    simulator = Simulator(course, car, driver, **more)
     out.mkdir()
-    write_drive(
-        simulator, out, about_run(simulator, "replay", "rx7", 1), 1, longest, lambda *_: None
-    )
+    return write_run(out, course, car, driver, longest, **more)
+
+
+def write_run(
+    out: Path, course: Course | None, car: Car, driver: object, longest: float, **more: object
+) -> Run:
+    """A drive as a run's folder."""
+    simulator, pilot = Simulator.of(course, car, **more), Pilot.of(driver, course, car)
+    about = about_run(simulator, pilot, course, "replay", "rx7", 1, car, {"kind": "replay"})
+    write_drive(simulator, pilot, course, out, about, 1, longest)
     return read_run(out)
+
+
+def driven(
+    course: Course | None,
+    car: Car,
+    driver: object,
+    seconds: float,
+    *,
+    nominal: Car | None = None,
+    estimate: str = "filter",
+    link: Link = ONBOARD,
+    **more: object,
+) -> Record:
+    """The record of a drive; the pilot knows the car itself where no `nominal` one is given."""
+    pilot = Pilot.of(driver, course, nominal or car, estimate, link, more.get("dt", 0.001))
+    return Simulator.of(course, car, link=link, **more).record(pilot, seconds)
+
+
+def judged(course: Course | None, record: Record, dt: float = 0.001) -> tuple[Score, list]:
+    """What the judge makes of a drive, and of its turns."""
+    task = Task.of(course)
+    rows = np.arange(0, len(record.tick), round(PERIOD / dt))
+    own = (record.motion, record.wall_contacts, record.rolled_over, record.status.turn)
+    own = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], own)
+    score, _ = task.follow(task.init(), Sample(dt * record.tick[rows], *own))
+    return score, turns.results(score.turns, float(score.time))

@@ -16,10 +16,13 @@ from countersteer.drivers.straighten import lane
 from countersteer.estimation import lidar_walls
 from countersteer.estimation.kalman import diagonal
 from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.rollout import REACHED, watched
+from countersteer.evaluation.rollout import watched
 from countersteer.evaluation.watches import Errors
+from countersteer.pilot import Pilot
 from countersteer.sensing import lidar
-from countersteer.simulator import Simulator, padded, scan
+from countersteer.simulator import Simulator, scan
+from countersteer.task.task import Outcome
+from countersteer.world.walls import padded
 
 WIDTH = 1.4
 SCANNER = load_car("rx7", ("sensors.lidar.beams=72",)).sensors.lidar
@@ -63,13 +66,13 @@ def test_a_place_told_late_is_known_now(reports):
     course = load_course("box")
     x, y, heading = course.start
     driver = drift_turn(course, car, straight_by="pose")
-    simulator = Simulator(course, car, driver, seed=2, start=(x - 0.1, y + 0.05, heading + 0.04))
-    plan = simulator.plan()
-    around, loop = simulator.begin(plan)
+    pilot = Pilot.of(driver, course, car)
+    simulator = Simulator.of(course, car, seed=2, start=(x - 0.1, y + 0.05, heading + 0.04))
+    loop, memory = simulator.init(), pilot.init(simulator.root)
     off = []
     for _ in range(12):
-        loop, record = scan(plan, 250, car, around, driver, loop)
-        motion, known = loop.state.motion, loop.estimate
+        loop, memory, record = scan(simulator, pilot, 250, loop, memory)
+        motion, known = loop.state.motion, memory.estimate
         off.append((known.x - motion.x, known.y - motion.y, known.mean[3] - motion.heading))
         assert not np.any(record.wall_contacts)
     # The filter was at the last tick but four; at 2 m/s that is a centimetre.
@@ -81,10 +84,10 @@ def test_whoever_is_told_the_truth_makes_no_errors():
     course, car, seeds = load_course("box"), load_car("rx7"), range(4)
     drawn = draw(load_population("around"), car, course, seeds, np.float64)
     driver = drift_turn(course, car)
-    watch = Errors(lane=lane(course), inside=float(chi2.ppf(0.95, 3)))
-    simulator = Simulator(course, car, driver, estimate="truth")
-    score, kept = watched(simulator, drawn, [driver] * 4, seeds, 1, 12.0, watch, lanes=4)
-    assert np.all(score.status == REACHED)
+    watch = Errors(lane=lane(course), sonar=car.sensors.sonar, inside=float(chi2.ppf(0.95, 3)))
+    pilot = Pilot.of(driver, course, car, "truth")
+    score, kept = watched(course, pilot, drawn, [driver] * 4, seeds, 1, 12.0, watch, lanes=4)
+    assert np.all(score.outcome == Outcome.REACHED.code)
     assert np.all(kept.drifting > 50)
     np.testing.assert_allclose(kept.slip, 0.0, atol=1e-12)
     assert np.all(np.degrees(np.sqrt(kept.reckoned / kept.drifting)) > 1.0)

@@ -10,8 +10,9 @@ from countersteer.car.files import load_car
 from countersteer.errors import InputError
 from countersteer.evaluation.compare import Compared, compare, draw_comparison, sensed, slides
 from countersteer.runs.dart import POINT_X, POINT_Y, import_dart
-from countersteer.runs.files import TRUTH, Table, TableWriter, command_rows, write_table
+from countersteer.runs.files import Table, TableWriter, command_rows, write_table
 from countersteer.runs.run import Run, read_run
+from countersteer.signals import TRUTH
 from countersteer.tuning import windows
 from countersteer.tuning.windows import (
     ENCODER_QUANTUM,
@@ -256,7 +257,7 @@ def simulated(car, drive, tmp_path_factory) -> Run:
         (tick + 1) * dt,
         *(leaf[:, 0] for leaf in (*motion[:6], *motion.wheels, motion.steering)),
     ]
-    truth = dict(zip(TRUTH[:-1], columns, strict=True))
+    truth = dict(zip(("time_s", *(c.name for c in TRUTH[:-1])), columns, strict=True))
     write_table(folder / "truth.csv", {name: column[4::5] for name, column in truth.items()})
     return read_run(folder)
 

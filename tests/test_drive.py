@@ -1,22 +1,26 @@
 """The closed loop: drives from the command line, and drivers in and out of JAX."""
 
+import dataclasses
 import importlib.util
 import json
 import math
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from conftest import driven
 from countersteer import cli
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
-from countersteer.drivers.driver import Command
 from countersteer.link.link import RADIO
+from countersteer.pilot import Pilot
 from countersteer.runs.files import read_commands, read_table
 from countersteer.runs.run import read_run
+from countersteer.signals import Command
 from countersteer.simulator import Simulator, scan
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wall_follower.py"
@@ -88,7 +92,9 @@ def test_commands_come_at_the_rate_of_the_board(box):
 
 
 class Stepped:
-    """A driver hidden from JAX: it is called from Python."""
+    """A driver hidden from JAX: it is called from Python, as often as the other."""
+
+    period = 0.001
 
     def __init__(self, inner):
         self.inner = inner
@@ -100,40 +106,44 @@ class Stepped:
     def act(self, memory, observation):
         return self.act_compiled(memory, observation)
 
+    def status(self, memory):
+        return self.inner.status(memory)
+
 
 def test_a_driver_stepped_in_python_equals_the_same_driver_scanned():
     course, car = load_course("box"), load_car("rx7")
     driver = drift_turn(course, car)
-    scanned = list(Simulator(course, car, driver, seed=3).run(1.5))
-    stepped = list(Simulator(course, car, Stepped(driver), seed=3).run(1.5))
-    for name in ("x", "y", "heading", "vx", "vy", "yaw_rate"):
-        one = np.concatenate([getattr(r.motion, name) for r in scanned])
-        other = np.concatenate([getattr(r.motion, name) for r in stepped])
+    scanned = driven(course, car, driver, 1.5, seed=3)
+    stepped = driven(course, car, Stepped(driver), 1.5, seed=3)
+    for one, other in zip(scanned.motion[:6], stepped.motion[:6], strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
-    assert scanned[-1].turn[-1] == stepped[-1].turn[-1] == 1
+    assert scanned.status.turn[-1] == stepped.status.turn[-1] == 1
 
 
 def test_a_batch_of_drives_equals_a_loop():
     """Two cars that differ, each alone and both at once, over a second in 64 bits."""
-    from countersteer.simulator import scan
-
     course = load_course("box")
     cars = [load_car("rx7"), load_car("rx7", ["body.mass_kg=1.7", "battery.wear=0.4"])]
-    driver = drift_turn(course, cars[0])
-    simulator = Simulator(course, cars[0], driver)
-    plan = simulator.plan()
+    pilot = Pilot.of(drift_turn(course, cars[0]), course, cars[0])
+    simulator = Simulator.of(course, cars[0])
+
+    def with_car(car):
+        world = dataclasses.replace(simulator.world, car=car)
+        return dataclasses.replace(simulator, world=world)
+
     with jax.enable_x64(True):
-        around, loop = simulator.begin(plan)
+        begun = simulator.init(), pilot.init(simulator.root)
         both = jax.tree.map(lambda *leaves: np.stack(leaves), *cars)
-        batch = jax.jit(jax.vmap(lambda car, loop: scan(plan, 500, car, around, driver, loop)))
-        loops = jax.tree.map(lambda leaf: np.stack([leaf] * 2), loop)
+        batch = jax.jit(jax.vmap(lambda car, *at: scan(with_car(car), pilot, 500, *at)[:2]))
+        loops = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), begun)
         for _ in range(2):
-            loops, _ = batch(both, loops)
+            loops = batch(both, *loops)
         for i, car in enumerate(cars):
-            alone = loop
+            alone = begun
             for _ in range(2):
-                alone, _ = scan(plan, 500, car, around, driver, alone)
-            for one, other in zip(alone.state.motion, loops.state.motion, strict=True):
+                alone = scan(with_car(car), pilot, 500, *alone)[:2]
+            motion = loops[0].state.motion
+            for one, other in zip(alone[0].state.motion, motion, strict=True):
                 np.testing.assert_allclose(np.asarray(other)[..., i], np.asarray(one), atol=1e-9)
 
 
@@ -152,9 +162,7 @@ def test_over_the_radio_packets_come_late_and_get_lost():
 
     driver = Wiggle()
     car = load_car("rx7")
-    record = next(iter(Simulator(None, car, driver, RADIO, seed=1).run(0.5)))
-    pieces = [record, *list(Simulator(None, car, driver, RADIO, seed=1).run(4.0))]
-    steering = np.concatenate([p.command.steering for p in pieces[1:]])
+    steering = driven(None, car, driver, 4.0, link=RADIO, seed=1).command.steering
     changes = np.nonzero(np.diff(steering))[0] + 1
     assert np.all(changes % 100 == 20)
     assert 25 <= len(changes) < 40  # of 40 sent, each lost with a chance of 5 %
@@ -165,7 +173,6 @@ def test_over_the_radio_packets_come_late_and_get_lost():
 
 def test_a_car_that_hears_nothing_stops():
     """A radio that loses everything after the first packets: the throttle goes to 0."""
-    import dataclasses
 
     class Full:
         def reset(self, key):
@@ -175,9 +182,9 @@ def test_a_car_that_hears_nothing_stops():
             return Command(0.5, 0.0), None
 
     deaf = dataclasses.replace(RADIO, loss=0.97)
-    record = list(Simulator(None, load_car("rx7"), Full(), deaf, seed=0).run(6.0))
-    throttle = np.concatenate([p.command.throttle for p in record])
-    arrived = np.concatenate([p.fresh for p in record]) & (throttle > 0)
+    record = driven(None, load_car("rx7"), Full(), 6.0, link=deaf)
+    throttle = record.command.throttle
+    arrived = record.fresh & (throttle > 0)
     last = np.nonzero(arrived)[0]
     assert len(last)
     for tick in last:
@@ -190,13 +197,11 @@ def test_the_example_drives_down_the_middle():
     spec = importlib.util.spec_from_file_location("wall_follower", EXAMPLE)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    simulator = Simulator(
-        load_course("straight"), load_car("rx7"), module.WallFollower(), start=(0.5, 0.2, 0.0)
-    )
-    *_, last = simulator.run(3.0)
-    assert last.motion.x[-1] > 2.5
-    assert abs(last.motion.y[-1]) < 0.1
-    assert last.wall_contacts[-1] == 0
+    course, car = load_course("straight"), load_car("rx7")
+    record = driven(course, car, module.WallFollower(), 3.0, start=(0.5, 0.2, 0.0))
+    assert record.motion.x[-1] > 2.5
+    assert abs(record.motion.y[-1]) < 0.1
+    assert record.wall_contacts[-1] == 0
 
 
 def test_straighten_comes_back_to_the_middle(tmp_path, capsys):
@@ -219,13 +224,11 @@ def test_the_estimate_is_said_and_used(tmp_path, capsys):
 def test_a_drive_is_one_program():
     """A loop whose types change in its first piece would be traced and compiled twice."""
     course, car = load_course("box"), load_car("rx7")
-    driver = drift_turn(course, car)
-    simulator = Simulator(course, car, driver)
-    plan = simulator.plan()
+    simulator, pilot = Simulator.of(course, car), Pilot.of(drift_turn(course, car), course, car)
     with jax.enable_x64(True):
-        around, loop = simulator.begin(plan)
-        before = jax.eval_shape(lambda loop: loop, loop)
-        after = jax.eval_shape(lambda loop: scan(plan, 2, car, around, driver, loop)[0], loop)
+        begun = simulator.init(), pilot.init(simulator.root)
+        before = jax.eval_shape(lambda *at: at, *begun)
+        after = jax.eval_shape(lambda *at: scan(simulator, pilot, 2, *at)[:2], *begun)
     leaves = zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
     for (path, a), b in leaves:
         assert (a.dtype, a.weak_type) == (b.dtype, b.weak_type), path

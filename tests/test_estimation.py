@@ -1,5 +1,6 @@
 """What the filters believe, against the truth of drives with cars that are not the nominal one."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -16,10 +17,12 @@ from countersteer.drivers.drift_turn import drift_turn
 from countersteer.estimation import dead_reckoning, pose, spikes, velocity
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.wall_angle import wall_angle
+from countersteer.pilot import Pilot
 from countersteer.sensing.sonar import distances, edges
-from countersteer.sensing.suite import Reading
-from countersteer.simulator import Simulator, padded, scan
+from countersteer.signals import Reading
+from countersteer.simulator import Simulator, scan
 from countersteer.world import battery
+from countersteer.world.walls import padded
 
 CARS, TICKS, STEP, DT = 16, 4000, 5, 1e-3
 COURSE = load_course("box")
@@ -74,24 +77,23 @@ def drives() -> Drives:
         x, y, heading = COURSE.start
         start = (x, y + 0.03 * rng.normal(), heading + 0.02 * rng.normal())
         car = jax.tree.map(np.float32, car)
-        simulators.append(
-            Simulator(COURSE, car, driver, estimate="reckoning", seed=seed, charge=charge,
-                      start=start, nominal=NOMINAL)
-        )  # fmt: skip
-    plan = simulators[0].plan()
+        simulators.append(Simulator.of(COURSE, car, seed=seed, charge=charge, start=start))
+    pilot = Pilot.of(driver, COURSE, NOMINAL, "reckoning").typed(np.float32)
     with jax.enable_x64(False):
-        begun = [s.begin(plan) for s in simulators]
-        around = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[b[0] for b in begun])
-        loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[b[1] for b in begun])
+        begun = [(s.init(), pilot.init(s.root)) for s in simulators]
+        loop, memory = jax.tree.map(lambda *leaves: jnp.stack(leaves), *begun)
         loop = loop._replace(tick=jnp.int32(0))
         axes = jax.tree.map(lambda _: 0, loop)._replace(tick=None)
         cars = stacked([s.car for s in simulators])
+        seeds = np.arange(CARS, dtype=np.int32)
 
-        def one(car, around, loop):
-            record = scan(plan, TICKS, car, around, driver, loop)[1]
-            return jax.tree.map(lambda leaf: leaf[::STEP], record._replace(forces=None))
+        def one(car, seed, loop, memory):
+            world = dataclasses.replace(simulators[0].world, car=car)
+            own = dataclasses.replace(simulators[0], world=world, seed=seed)
+            record = scan(own, pilot, TICKS, loop, memory)[2]
+            return jax.tree.map(lambda leaf: leaf[::STEP], record)
 
-        record = jax.vmap(one, (0, 0, axes), 1)(cars, around, loop)
+        record = jax.vmap(one, (0, 0, axes, 0), 1)(cars, seeds, loop, memory)
         record = jax.tree.map(np.asarray, record)
     sound = (record.wall_contacts == 0) & (record.rolled_over == 0)
     return Drives(record, cars, np.array([s.charge for s in simulators]), sound)
@@ -301,7 +303,7 @@ def test_the_angle_to_the_wall_is_known_on_straights(drives, estimates, left):
     if left != "sound":
         worth = np.inf if left == "dead" else 0.4
         sonar[1] = Reading(np.full_like(sonar[1].value, worth), sonar[1].tick)
-    turned = np.diff(record.turn, axis=0, prepend=0) > 0
+    turned = np.diff(record.status.turn, axis=0, prepend=0) > 0
     ages = [np.float32(DT) * (TICK[:, None] - reading.tick).astype(np.float32) for reading in sonar]
     with jax.enable_x64(False):
         memory = locator.initial_memory(heading=COURSE.start[2], dtype=np.float32)
@@ -321,13 +323,15 @@ def test_the_angle_to_the_wall_is_known_on_straights(drives, estimates, left):
         inputs = (tuple(sonar), tuple(ages), estimate, time, turned)
         offset, angle = jax.jit(lambda m, xs: jax.lax.scan(step, m, xs)[1])(memory, inputs)
     motion = record.motion
-    bearing = COURSE.start[2] - record.turn * math.pi / 2
+    bearing = COURSE.start[2] - record.status.turn * math.pi / 2
     along = np.cos(bearing), np.sin(bearing)
-    corner = COURSE.line[record.turn.astype(int) % 4]
+    corner = COURSE.line[record.status.turn.astype(int) % 4]
     true_offset = along[0] * (motion.y - corner[..., 1]) - along[1] * (motion.x - corner[..., 0])
     true_angle = motion.heading - bearing
-    since = (np.cumsum(record.turn >= 1, axis=0) * STEP * DT > 1.5) & (record.turn == 1)
-    straight = (since | (record.turn == 0)) & (np.abs(true_angle) < 0.2) & drives.sound
+    since = (np.cumsum(record.status.turn >= 1, axis=0) * STEP * DT > 1.5) & (
+        record.status.turn == 1
+    )
+    straight = (since | (record.status.turn == 0)) & (np.abs(true_angle) < 0.2) & drives.sound
     straight = straight & (TICK[:, None] > 800)
     assert straight.sum() > 500
     assert math.degrees(rms((angle - true_angle)[straight])) < 2.0
@@ -372,7 +376,7 @@ def test_the_pose_settles_from_anywhere_within_two_turns(drives, estimates):
 
     settled, trials, errors = 0, 0, []
     with jax.enable_x64(False):
-        for car in np.nonzero(drives.sound[-1] & (record.turn[-1] >= 2))[0]:
+        for car in np.nonzero(drives.sound[-1] & (record.status.turn[-1] >= 2))[0]:
             own = [jax.tree.map(lambda leaf, i=car: leaf[:, i], thin(t))
                    for t in (estimates[0], record.readings.sonar)]  # fmt: skip
             found = jax.tree.map(float, locate(jax.random.key(int(car)), *own))

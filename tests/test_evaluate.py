@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from conftest import driven, judged
 from countersteer.car.files import load_car
 from countersteer.cli import main
+from countersteer.course.along import line_of
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.errors import InputError
 from countersteer.evaluation import rollout
 from countersteer.evaluation.evaluate import interval
 from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.turns import find_turns
-from countersteer.simulator import Simulator
+from countersteer.pilot import Pilot
 
 SEEDS = range(400)
 
@@ -96,40 +97,23 @@ def test_intervals_are_wilsons():
 
 
 def test_a_batch_judges_as_a_recorded_drive_is_judged():
-    """`rollout.follow` on the samples of a recorded drive, beside `turns.find_turns`."""
-    course, car = load_course("box"), load_car("rx7")
-    record = Simulator(course, car, drift_turn(course, car), estimate="truth").record(9.0)
-    every = slice(0, None, 5)
-    motion = jax.tree.map(lambda leaf: np.asarray(leaf)[every], record.motion)
-    time, turn = 0.001 * record.tick[every], record.turn[every]
-    found = find_turns(course, time, motion.heading, motion.vx, motion.vy, motion.yaw_rate, turn, 1)
-    with jax.enable_x64(True):
-        way = rollout.way_of(course, 1, np.float64)
-        score = rollout.initial_score(course, 4, np.float64)
-        state = Sample(motion, record.rolled_over[every], record.wall_contacts[every])
-
-        def step(score, sample):
-            now, turns, state = sample
-            return rollout.follow(way, score, state, turns, now), None
-
-        score, _ = jax.lax.scan(step, score, (time, turn, state))
-    assert len(found) == 4
-    turns = jax.tree.map(np.asarray, score.turns)
-    for i, one in enumerate(found):
-        assert turns.begin[i] == pytest.approx(one.begin_s)
-        assert turns.end[i] == pytest.approx(one.end_s)
-        assert turns.entry_speed[i] == pytest.approx(one.entry_speed_mps)
-        assert np.degrees(turns.peak_sideslip[i]) == pytest.approx(one.peak_sideslip_deg)
-        assert np.degrees(turns.peak_yaw_rate[i]) == pytest.approx(one.peak_yaw_rate_degps)
-        assert np.degrees(turns.error[i]) == pytest.approx(one.heading_error_deg)
-    assert int(score.status) == rollout.REACHED
-    assert float(score.goal_time) == pytest.approx(9.0, abs=2.5)
-
-
-class Sample(rollout.NamedTuple):
-    motion: object
-    rolled_over: object
-    wall_contacts: object
+    """The cars of a batch, in 64 bits, beside each of them driven alone and recorded."""
+    course, car, seeds = load_course("ess"), load_car("rx7"), range(4)
+    drawn = draw(load_population("around"), car, course, seeds, np.float64)
+    driver = drift_turn(course, car)
+    score = rollout.rollouts(
+        course, Pilot.of(driver, course, car), drawn, [driver] * 4, seeds, 1, 14.0, lanes=4
+    )
+    for i in seeds:
+        one, floor = jax.tree.map(lambda leaf, i=i: leaf[i], (drawn.cars, drawn.floor))
+        record = driven(
+            course, one, driver, 14.0, nominal=car, seed=i, charge=float(drawn.charge[i]),
+            start=tuple(map(float, drawn.pose[i])), floor=floor,
+        )  # fmt: skip
+        alone, turns = judged(course, record)
+        assert len(turns) == 4
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(score), strict=True):
+            np.testing.assert_allclose(a, b[i], atol=1e-6)
 
 
 def test_evaluate_tells_what_the_design_says(tmp_path, capsys):
@@ -172,7 +156,7 @@ def test_progress_along_the_line_is_that_of_the_course():
     from countersteer.course.course import place
 
     xy = np.array([place(course, d)[:2] for d in along]) + rng.uniform(-0.3, 0.3, (60, 2))
-    line = rollout.line_of(course, np.float32)
+    line = line_of(course, np.float32)
     last, found = jnp.float32(0.5), []
     for x, y in xy:
         last = line.follow(x, y, last).distance

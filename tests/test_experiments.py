@@ -11,7 +11,7 @@ import pytest
 from countersteer import cli
 from countersteer.car.files import load_car
 from countersteer.drivers.drift_turn import SPIN, STRAIGHT
-from countersteer.drivers.driver import Command
+from countersteer.drivers.driver import Status
 from countersteer.evaluation import experiments
 from countersteer.evaluation.experiments import (
     battery,
@@ -25,6 +25,7 @@ from countersteer.evaluation.experiments import (
 from countersteer.evaluation.experiments.found import write
 from countersteer.evaluation.open_turns import Series
 from countersteer.runs.run import read_run
+from countersteer.signals import Command
 from test_open_turns import LANES, TIME, slowing, write_run
 
 
@@ -149,6 +150,9 @@ class Stub:
         begins = (observation.time >= 0.5) & (memory.turn == 0)
         phase = jnp.where(begins, SPIN, memory.phase)
         return Command(-1.0 * phase, 0.0), Inner(phase, memory.turn + jnp.where(begins, 1, 0))
+
+    def status(self, memory):
+        return Status(memory.turn, memory.phase)
 
 
 class Seen(NamedTuple):

@@ -482,7 +482,7 @@ def test_only_a_wall_is_found_in_what_the_simulator_drove(tmp_path):
 @needs_data
 def test_the_dart_logs_are_clean_but_for_the_dead_man_switch(tmp_path):
     logs = sorted((DATA / "dart").rglob("*.csv"))
-    assert len(logs) == 30
+    assert len(logs) >= 30
     for log in logs:
         run = read_run(Path(import_dart(log, tmp_path / log.parent.name)["run"]))
         for fault in faults(run):

@@ -25,8 +25,8 @@ from countersteer.course.files import library as courses
 from countersteer.course.files import load_course
 from countersteer.errors import InputError
 from countersteer.runs.files import column_rows, command_rows, read_commands, read_table
+from countersteer.runs.recorder import new_folder
 from countersteer.runs.run import read_run
-from countersteer.runs.writer import new_folder
 from countersteer.text import read_text
 
 COMMANDS = "time_s,throttle,direction,steering_deg\n"

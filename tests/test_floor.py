@@ -10,17 +10,14 @@ import jax
 import numpy as np
 import pytest
 
-from conftest import LANES, start, varied
+from conftest import LANES, start, varied, write_run
 from countersteer import cli
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.replay import Replay
 from countersteer.errors import InputError
-from countersteer.evaluation.drive import about_run
-from countersteer.evaluation.drive import drive as write_drive
 from countersteer.runs.run import read_run
-from countersteer.simulator import Simulator
 from countersteer.world import floor, planar
 from countersteer.world.angle import cosine
 from countersteer.world.floor import Floor, Wave
@@ -228,11 +225,9 @@ def test_a_drive_on_a_floor_is_replayed_on_it(
         times=np.array([0.0, 0.8]), throttle=np.array([0.8, 0.0]), steering=np.array([0.0, -0.4])
     )
     for name, floor_of in (("uneven", ground), ("even", None)):
-        simulator = Simulator(course, RX7, driver, floor=floor_of)
         (tmp_path / name).mkdir()
-        about = about_run(simulator, "replay", "rx7", 1)
-        assert ("floor" in about) == (floor_of is not None)
-        write_drive(simulator, tmp_path / name, about, 1, 1.5, lambda *_: None)
+        run = write_run(tmp_path / name, course, RX7, driver, 1.5, floor=floor_of)
+        assert ("floor" in run.about) == (floor_of is not None)
     assert jax.tree.all(
         jax.tree.map(np.equal, floor.floor_of_run(read_run(tmp_path / "uneven").about), ground)
     )

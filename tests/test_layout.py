@@ -10,27 +10,30 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "countersteer"
 
-EVERYONE = {"errors", "text", "__init__"}
+EVERYONE = {"errors", "text", "__init__", "signals", "streams"}
 MAY_IMPORT = {
     "car": set(),
     "course": {"car"},
     "world": {"car", "course"},
-    "sensing": {"car", "course", "world"},  # sensors look at the world's state
+    "sensing": {"car", "course", "world"},  # sensors look at the world's motion
     "link": {"car"},
     "estimation": {"car", "course", "world", "sensing"},
-    "drivers": {"car", "course", "world", "estimation"},
-    "simulator": {"car", "course", "world", "sensing", "link", "estimation", "drivers"},
+    "drivers": {"car", "course", "estimation", "world"},  # the motor's law, for feed-forward
+    "pilot": {"car", "course", "link", "estimation", "drivers"},  # and not the world
+    "simulator": {"car", "course", "world", "sensing", "link", "drivers", "pilot"},
+    "task": {"car", "course"},
     "runs": {"car", "course"},
     "tuning": {"car", "world", "sensing", "runs"},
     "evaluation": {
-        "car", "course", "world", "sensing", "link", "simulator", "runs", "tuning", "estimation",
+        "car", "course", "world", "sensing", "link", "pilot", "simulator", "task", "runs",
+        "tuning", "estimation",
         "drivers",  # the bench times a drive, so it needs one that drives
     },
     "learning": {
-        "car", "course", "simulator", "runs", "evaluation",
+        "car", "course", "pilot", "simulator", "task", "runs", "evaluation",
         "drivers",  # what is learned is a driver's numbers
     },
-    "viewing": {"car", "runs", "simulator"},  # a car is drawn to its size
+    "viewing": {"car", "runs", "task", "world"},  # a car is drawn to its size, with its forces
     "listing": {"car", "course"},
     "completion": {"car", "course"},
     "cli": None,

@@ -9,19 +9,20 @@ from countersteer.course.files import load_course
 from countersteer.drivers import policy
 from countersteer.drivers.policy import load_policy
 from countersteer.evaluation.population import load_population
-from countersteer.evaluation.rollout import REACHED, TOUCHED, Score, Turns
 from countersteer.learning import turning
+from countersteer.task.task import Outcome, Score
+from countersteer.task.turns import Turns
 
 
-def score(slip, error, status=(REACHED,), ended=(1.0,)):
+def score(slip, error, outcome=(Outcome.REACHED.code,), ended=(1.0,)):
     turns = {name: np.zeros((1, 1)) for name in Turns._fields}
     turns |= {
         "peak_sideslip": np.radians([[slip]]),
         "error": np.radians([[error]]),
         "end": np.array([ended]),
     }
-    others = dict.fromkeys(("distance", "furthest", "furthest_at", "goal_time", "stirred_at"), 0)
-    return Score(status=np.array(status), turns=Turns(**turns), **others)
+    others = dict.fromkeys(Score._fields, 0)
+    return Score(**others)._replace(outcome=np.array(outcome), turns=Turns(**turns))
 
 
 def test_numbers_go_into_a_row_and_come_back():
@@ -41,7 +42,7 @@ def test_a_good_drift_costs_nothing_and_each_fault_its_own():
     assert turning.cost(score(40.0, 3.0)) == pytest.approx([0.35])
     assert turning.cost(score(32.0, 0.0)) == pytest.approx([0.5])
     assert turning.cost(score(20.0, 0.0)) == pytest.approx([1.7 + 1.2])
-    failed = turning.cost(score(40.0, 0.0, (TOUCHED,), (np.inf,)))
+    failed = turning.cost(score(40.0, 0.0, (Outcome.TOUCHED.code,), (np.inf,)))
     assert failed == pytest.approx([8.0])
 
 

@@ -13,7 +13,7 @@ LARGEST = 300_000  # bytes, outputs included
 
 CHECKS = """
 assert len(motion.x) == 6500
-assert record.turn[-1] == 3 and record.wall_contacts[-1] == 0
+assert record.status.turn[-1] == 3 and record.wall_contacts[-1] == 0
 assert 25 < np.degrees(np.abs(sideslip).max()) < 60
 # The less the rear tyres hold, the wilder the drift; with rubber there is none.
 assert np.all(np.diff(slips[2:9]) < 0) and slips[2] > 45 and np.all(slips[8:] < 12)

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import conftest
+from conftest import judged
 from countersteer import cli
 from countersteer.car.files import load_car
 from countersteer.course.along import legs_of, line_of
@@ -19,9 +21,7 @@ from countersteer.drivers.driver import Heard, Observation
 from countersteer.drivers.plan import is_plan, library, load_plan, plan
 from countersteer.errors import InputError
 from countersteer.estimation.estimate import Estimate
-from countersteer.evaluation.turns import find_turns
 from countersteer.runs.files import read_commands
-from countersteer.simulator import Simulator
 
 CAR = load_car("rx7")
 STEP, STEPS = 0.005, 400
@@ -86,11 +86,8 @@ def test_the_corner_is_told_by_the_wall_where_one_stands_ahead():
 
 def driven(course, driver, seconds):
     """Turns, places, and whether a wall was touched, of the nominal car that knows its state."""
-    record = Simulator(course, CAR, driver, estimate="truth").record(seconds)
-    motion, time = record.motion, 0.001 * record.tick
-    turns = find_turns(
-        course, time, motion.heading, motion.vx, motion.vy, motion.yaw_rate, record.turn, 1
-    )
+    record = conftest.driven(course, CAR, driver, seconds, estimate="truth")
+    turns, motion = judged(course, record)[1], record.motion
     distance = progress(course, motion.x[::20], motion.y[::20], course.start_distance)
     return turns, distance[-1], record.wall_contacts[-1]
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import tomli_w
 
-from countersteer import cli
+from countersteer.drivers.library import make_driver
 from countersteer.drivers.policy import TABLES, load_policy, policy_tables, save_policy
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.errors import InputError
+from countersteer.runs.files import read_commands
 from test_open_turns import TURNING
 
 STOPS = StopAngle(
@@ -83,9 +84,9 @@ def test_a_policy_drives_by_its_own_numbers(tmp_path):
     path = tmp_path / "p.toml"
     path.write_text(WHOLE.replace("hold_p = 0.9", "hold_p = 1.9"))
     course, car = load_course("box"), load_car("rx7")
-    driver = cli.make_driver(str(path), course, car, None, 1)
+    driver, _ = make_driver(str(path), course, car, None, 1, read_commands)
     assert driver.turning.hold_p == 1.9
-    own = cli.make_driver("drift-turn", course, car, None, 1).turning
+    own = make_driver("drift-turn", course, car, None, 1, read_commands)[0].turning
     assert own.hold_p == load_policy("drift-turn").turning.hold_p != 1.9
     with pytest.raises(InputError, match="cannot be read"):
-        cli.make_driver("none.toml", course, car, None, 1)
+        make_driver("none.toml", course, car, None, 1, read_commands)

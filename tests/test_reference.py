@@ -15,23 +15,13 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from countersteer.car.car import (
-    GRAVITY,
-    Body,
-    Car,
-    Drivetrain,
-    MagicFormula,
-    Servo,
-    Tire,
-    Tires,
-    Wheels,
-)
+from countersteer.car.car import GRAVITY, Body, Car, Drivetrain, MagicFormula, Servo, Tire, Tires
 from countersteer.car.files import load_car, save_car
-from countersteer.simulator import padded
+from countersteer.signals import Command, Motion, Wheels
 from countersteer.world import motor, planar, tyre
 from countersteer.world.chassis import Vector
-from countersteer.world.planar import Command, Tick
-from countersteer.world.state import Motion
+from countersteer.world.planar import Tick
+from countersteer.world.walls import padded
 
 OPEN_FLOOR = padded(np.zeros((0, 4)), np.dtype(float))
 BMW_TIRE = MagicFormula()

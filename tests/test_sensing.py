@@ -12,19 +12,15 @@ import numpy as np
 import pytest
 import shapely
 
-from conftest import start, varied
+from conftest import start, varied, write_run
 from countersteer.car.car import Car, Lidar, LineDetector, Mount, Position, Sonar
 from countersteer.car.files import load_car
 from countersteer.course.course import place
 from countersteer.course.files import load_course
 from countersteer.drivers.replay import Replay
 from countersteer.errors import InputError
-from countersteer.evaluation.drive import about_run
-from countersteer.evaluation.drive import drive as write_drive
-from countersteer.runs.run import read_run
 from countersteer.sensing import lidar, parts, sonar, suite
-from countersteer.simulator import Simulator
-from countersteer.world.state import Motion
+from countersteer.signals import Motion
 
 RX7 = load_car("rx7")
 SCENES = 1000  # always as many, so that there is one program for each number of mounts
@@ -624,13 +620,9 @@ def test_sensors_begin_for_cars_of_a_batch_too() -> None:
 def test_better_sensors_are_switched_on_and_written(tmp_path: Path) -> None:
     wanted = ("sensors.lidar.beams=12", "sensors.lidar.rate_hz=20", "sensors.position.reports=pose")
     car = load_car("rx7", wanted)
-    simulator = Simulator(
-        None, car, Replay(times=np.zeros(1), throttle=np.ones(1), steering=np.zeros(1))
-    )
-    about = about_run(simulator, "replay", "rx7", 1)
-    assert about["rates"]["lidar_s"] == pytest.approx(0.05)
-    write_drive(simulator, tmp_path, about, 1, 0.5, lambda *_: None)
-    run = read_run(tmp_path)
+    driver = Replay(times=np.zeros(1), throttle=np.ones(1), steering=np.zeros(1))
+    run = write_run(tmp_path, None, car, driver, 0.5)
+    assert run.about["rates"]["lidar_s"] == pytest.approx(0.05)
     assert run.car.sensors.lidar.beams == 12
     told = run.telemetry
     assert [name for name in told if name.startswith(("lidar", "position"))] == [

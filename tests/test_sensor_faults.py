@@ -7,19 +7,20 @@ import tomllib
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from conftest import driven
 from countersteer import cli
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.link.link import RADIO
-from countersteer.sensing import faults
-from countersteer.sensing.faults import FIELDS, KINDS, Fault
-from countersteer.sensing.suite import Reading, Readings
-from countersteer.simulator import Record, Simulator, observe, scan
+from countersteer.pilot import Pilot
+from countersteer.sensing import faults, suite
+from countersteer.sensing.faults import KINDS, Fault
+from countersteer.signals import Reading, Readings, flat, pairs
+from countersteer.simulator import Record, Simulator, scan
 
 COURSE = load_course("box")
 CAR = load_car(
@@ -30,7 +31,9 @@ CAR = load_car(
         "sensors.line_detector.lines=across-x",
     ),
 )
-SENSORS = ("sonar", "sonar_left", *FIELDS)
+CHANNELS = suite.channels(CAR)
+PARTS = tuple(dict.fromkeys(c.sensor for c in flat(CHANNELS) if "sonar" not in c.sensor))
+SENSORS = ("sonar", "sonar_left", *PARTS)
 EVERY = tuple(itertools.product(SENSORS, KINDS))
 DT, LATE = 1e-3, 1e6
 START, END = 0.8, 1.3  # s: the car drives straight on, at speed
@@ -51,7 +54,7 @@ def failing(*which: tuple[str, str]) -> tuple[Fault, ...]:
 
 def drive(which: tuple[Fault, ...], seconds: float = 2.0, **more: object) -> Record:
     driver = drift_turn(COURSE, load_car("rx7"), None, 1)
-    return Simulator(COURSE, CAR, driver, faults=which, **more).record(seconds)
+    return driven(COURSE, CAR, driver, seconds, faults=which, **more)
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +64,7 @@ def sound() -> Record:
 
 
 def fields(readings: Readings, sensor: str) -> list[Reading]:
-    mounts = CAR.sensors.sonar.mount_names
-    if sensor.startswith("sonar"):
-        return [
-            r
-            for name, r in zip(mounts, readings.sonar, strict=True)
-            if sensor in ("sonar", f"sonar_{name}")
-        ]
-    return [getattr(readings, name) for name in FIELDS[sensor]]
+    return [r for c, r in pairs(CHANNELS, readings) if c.sensor.startswith(sensor)]
 
 
 @pytest.mark.parametrize(("sensor", "kind"), EVERY)
@@ -97,7 +93,7 @@ def test_the_driver_never_commands_nan(sensor: str, kind: str, sound: Record) ->
             assert np.all(np.isfinite(spikes))
     after = own.tick[record.tick == record.tick[-1]]
     assert after >= round(END / DT), "it is well again"
-    others = [r for s in FIELDS for r in fields(record.readings, s) if s != sensor]
+    others = [r for s in PARTS for r in fields(record.readings, s) if s != sensor]
     assert all(np.any(window & (r.tick == record.tick)) for r in others), "no other fails"
 
 
@@ -108,23 +104,21 @@ def test_faults_that_never_come_change_nothing(sound: Record) -> None:
 
 
 def test_without_faults_there_is_nothing_of_them_in_the_loop() -> None:
-    driver = drift_turn(COURSE, CAR, None, 1)
-    simulator = Simulator(COURSE, CAR, driver)
-    around, loop = simulator.begin(simulator.plan())
+    simulator = Simulator.of(COURSE, CAR)
+    loop = simulator.init()
     assert loop.faulty is None
-    assert around.faults == ()
+    assert simulator.faults == ()
     assert loop.readings is loop.sensors.readings
 
 
 def test_faults_come_before_the_radio() -> None:
     dead = (Fault(sensor="sonar", kind="dead", start=0.0, duration=np.inf),)
-    driver = drift_turn(COURSE, load_car("rx7"), None, 1)
-    simulator = Simulator(COURSE, CAR, driver, RADIO, faults=dead)
-    plan = simulator.plan()
+    pilot = Pilot.of(drift_turn(COURSE, CAR, None, 1), COURSE, CAR, link=RADIO)
+    simulator = Simulator.of(COURSE, CAR, link=RADIO, faults=dead)
     with jax.enable_x64(True):
-        around, loop = simulator.begin(plan)
-        loop, _ = scan(plan, 500, CAR, around, driver, loop)
-        _, told = observe(plan, around, jax.tree.map(jnp.asarray, loop))
+        loop, memory = simulator.init(), pilot.init(simulator.root)
+        loop, memory, _ = scan(simulator, pilot, 500, loop, memory)
+        _, told = pilot.observe(memory, simulator.readings(loop), loop.tick)
     assert all(np.isinf(heard.age) for heard in told.sonar)
     assert 0 < float(told.gyroscope.age) < 0.2
 
@@ -132,7 +126,7 @@ def test_faults_come_before_the_radio() -> None:
 def test_spikes_are_another_draw_for_another_seed() -> None:
     key, tick = jax.random.key(0), np.int32(10)
     told = [
-        float(faults.spike(CAR, "gyroscope", np.float64(0.0), jax.random.fold_in(key, tick + i)))
+        float(faults.spike(CHANNELS.gyroscope, np.float64(0.0), jax.random.fold_in(key, tick + i)))
         for i in range(200)
     ]
     reach = float(CAR.sensors.gyroscope.reach)
@@ -183,4 +177,4 @@ def test_the_car_keeps_off_the_walls(sensor: str, kind: str) -> None:
     """On a straight. That it knows no place from outside makes it the plain car."""
     record = drive(failing((sensor, kind)), 8.0, nominal=load_car("rx7"))
     assert not np.any(record.wall_contacts)
-    assert record.turn[-1] >= 3
+    assert record.status.turn[-1] >= 3

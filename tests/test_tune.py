@@ -18,8 +18,9 @@ from countersteer.evaluation import folds
 from countersteer.evaluation.compare import compare
 from countersteer.runs.files import COMMANDS, TableWriter, command_rows
 from countersteer.runs.run import Run, read_run
-from countersteer.tuning import fit, shooting, tune
+from countersteer.tuning import fit, tune
 from countersteer.tuning.shooting import Shots
+from countersteer.world import plant
 
 TRUE = {
     "tires.front.friction": 0.45,
@@ -315,7 +316,7 @@ def test_no_window_is_one_line(tmp_path, capsys):
 def test_a_late_line_is_interpolated_to_fractions_of_a_tick():
     line = np.array([0.0, 0.0, 1.0, 1.0, 3.0])
     with jax.enable_x64(True):
-        late = np.asarray(shooting._late(line, 0.5))
+        late = np.asarray(plant.delayed(line, 0.5))
     np.testing.assert_allclose(late, [0, 0, 0.5, 1.0, 2.0])
 
 

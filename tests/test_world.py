@@ -14,10 +14,10 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import null_space
 
 from conftest import LANES, stacked, start, varied
-from countersteer.car.car import Car, Wheels
+from countersteer.car.car import Car
 from countersteer.car.files import load_car
+from countersteer.signals import Motion, Wheels
 from countersteer.world import chassis, motor, planar, servo, tyre
-from countersteer.world.state import Motion
 from countersteer.world.walls import collide
 
 STEPS = (1e-4, 1e-3, 1e-2)

@@ -18,7 +18,8 @@ from countersteer.errors import InputError
 if TYPE_CHECKING:
     from countersteer.car.car import Car
     from countersteer.course.course import Course
-    from countersteer.drivers.driver import Driver
+    from countersteer.pilot import Pilot
+    from countersteer.simulator import Simulator
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 DRIVERS = ("drift-turn", "straighten")
@@ -500,7 +501,11 @@ def run_drive(options: argparse.Namespace) -> int:
     """`drive`."""
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
+    from countersteer.drivers.library import make_driver
+    from countersteer.evaluation.drive import about_run
     from countersteer.link.link import LINKS
+    from countersteer.pilot import Pilot
+    from countersteer.runs.files import read_commands
     from countersteer.sensing.faults import read_fault
     from countersteer.simulator import Simulator
 
@@ -517,26 +522,28 @@ def run_drive(options: argparse.Namespace) -> int:
         speed, most = options.speed_mps
         if most != speed:
             raise InputError("--speed-mps LO:HI: a range is drawn from with --cars only")
-    driver = make_driver(options.driver, course, load_car(options.car), speed, options.laps)
+    nominal, link = load_car(options.car), LINKS[options.link]
+    driver, tables = make_driver(
+        options.driver, course, nominal, speed, options.laps, read_commands
+    )
     made = options.driver.endswith((".csv", ".toml"))
     name = Path(options.driver).stem if made else options.driver
-    simulator = Simulator(
+    pilot = Pilot.of(driver, course, nominal, options.estimate, link, options.dt)
+    simulator = Simulator.of(
         course,
         car,
-        driver,
-        LINKS[options.link],
-        options.estimate,
-        options.dt,
-        options.seed,
-        charge,
+        link=link,
+        dt=options.dt,
+        seed=options.seed,
+        charge=charge,
         start=start,
         floor=floor,
-        nominal=load_car(options.car),
         faults=tuple(read_fault(text) for text in options.fault),
     )
+    about = about_run(simulator, pilot, course, name, options.car, options.laps, nominal, tables)
     # A lap at a crawl still ends.
     longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
-    return record(options, simulator, name, course.name, longest, options.laps)
+    return record(options, simulator, pilot, course, about, longest, course.name)
 
 
 def check_laps(options: argparse.Namespace, course: "Course") -> None:
@@ -565,10 +572,12 @@ def run_evaluate(options: argparse.Namespace) -> int:
     """`evaluate`."""
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
+    from countersteer.drivers.library import make_driver
     from countersteer.evaluation import evaluate
     from countersteer.evaluation.population import load_population
     from countersteer.link.link import LINKS
-    from countersteer.runs.writer import new_folder
+    from countersteer.runs.files import read_commands
+    from countersteer.runs.recorder import new_folder
     from countersteer.simulator import keep_programs
 
     keep_programs(blocks=True, cores=os.cpu_count() or 1)
@@ -588,7 +597,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         for i, name in enumerate(options.driver):
 
             def made(speed: float | None, name: str = name) -> Any:
-                return make_driver(name, course, nominal, speed, options.laps)
+                return make_driver(name, course, nominal, speed, options.laps, read_commands)[0]
 
             def report(done: int, trials: int, before: int = i * options.trials) -> None:
                 progress.show(before + done, len(options.driver) * trials)
@@ -617,7 +626,10 @@ def run_replay(options: argparse.Namespace) -> int:
     """`replay`."""
     from countersteer.car.files import load_car
     from countersteer.course.files import course_of_run
-    from countersteer.drivers.replay import Replay
+    from countersteer.drivers.library import replay
+    from countersteer.estimation.dead_reckoning import DeadReckoning
+    from countersteer.evaluation.drive import about_run
+    from countersteer.pilot import Pilot
     from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator
@@ -657,15 +669,13 @@ def run_replay(options: argparse.Namespace) -> int:
     charge = 1.0 if options.battery is None else options.battery
     if run is not None:
         charge = float(run.about.get("battery_charge", 1.0))
-    driver = Replay(
-        times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
-    )
     course = course_of_run(run.about) if run else None
-    simulator = Simulator(
+    # A driver that plays commands looks at no estimate.
+    estimator = DeadReckoning(start=pose, dt=options.dt)
+    pilot = Pilot.with_estimator(replay(commands), estimator, dt=options.dt)
+    simulator = Simulator.of(
         course,
         car,
-        driver,
-        estimate="reckoning",  # which such a driver does not look at
         dt=options.dt,
         seed=options.seed,
         start=pose,
@@ -678,31 +688,36 @@ def run_replay(options: argparse.Namespace) -> int:
         raise InputError(f"{options.source}: commands go on to {times[-1]:g} s, over an hour")
     last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
     longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
-    return record(options, simulator, "replay", options.source.stem, longest, laps, name)
+    about = about_run(simulator, pilot, course, "replay", name, laps, car, {"kind": "replay"})
+    return record(options, simulator, pilot, course, about, longest, options.source.stem)
 
 
 def record(
     options: argparse.Namespace,
-    simulator: Any,
-    driver: str,
-    place: str,
+    simulator: "Simulator",
+    pilot: "Pilot",
+    course: "Course | None",
+    about: dict[str, Any],
     longest: float,
-    laps: int,
-    car_name: str | None = None,
+    place: str,
 ) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
-    from countersteer.evaluation.drive import about_run, drive
-    from countersteer.runs.writer import new_folder
+    from countersteer.evaluation.drive import drive
+    from countersteer.runs.recorder import new_folder
+    from countersteer.runs.run import read_run
     from countersteer.simulator import keep_programs
     from countersteer.viewing.picture import Painter
     from countersteer.viewing.report import report_html
+    from countersteer.viewing.view import view_of
 
     keep_programs(batches=False)
-    about = about_run(simulator, driver, car_name or options.car, laps)
-    folder = new_folder(options.out, f"{Path(place).stem}-{driver}")
+    folder = new_folder(options.out, f"{Path(place).stem}-{about['driver']}")
     painter = Painter(folder / "report.png")
     with Progress(options.json) as progress:
-        result, view = drive(simulator, folder, about, laps, longest, progress.show)
+        result = drive(
+            simulator, pilot, course, folder, about, about["laps"], longest, progress.show
+        )
+    view = view_of(read_run(folder))
     (folder / "report.html").write_text(report_html(view))
     painter.draw(view)
     if options.json:
@@ -898,7 +913,7 @@ def run_turns(options: argparse.Namespace) -> int:
     from countersteer.drivers.policy import load_policy
     from countersteer.evaluation import open_turns
     from countersteer.evaluation.population import load_population
-    from countersteer.runs.writer import new_folder
+    from countersteer.runs.recorder import new_folder
     from countersteer.simulator import keep_programs
 
     if options.runs:
@@ -943,8 +958,8 @@ def run_experiment(options: argparse.Namespace) -> int:
     from countersteer.car.files import load_car
     from countersteer.evaluation import experiments
     from countersteer.evaluation.experiments.found import write
+    from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
-    from countersteer.runs.writer import new_folder
     from countersteer.simulator import keep_programs
 
     # Only the closed loop is worth its time in a compiler that makes a function of it.
@@ -1124,34 +1139,6 @@ def plans() -> dict[str, str]:
     from countersteer.drivers.plan import library
 
     return library()
-
-
-def make_driver(
-    name: str, course: "Course", car: "Car", speed: float | None, laps: int
-) -> "Driver":
-    """A driver from the library, a policy or a plan, or one that replays a `commands.csv`."""
-    from countersteer.drivers import plan
-    from countersteer.drivers.drift_turn import drift_turn
-    from countersteer.drivers.policy import load_policy
-    from countersteer.drivers.replay import Replay
-    from countersteer.drivers.straighten import straighten
-    from countersteer.runs.files import read_commands
-
-    if name.endswith(".csv"):
-        if speed is not None:
-            raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
-        commands = read_commands(Path(name))
-        return Replay(
-            times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
-        )
-    if plan.is_plan(name):
-        return plan.load_plan(name, course, car, read_commands, speed, laps)
-    if name == "drift-turn" or name.endswith(".toml"):
-        return drift_turn(course, car, speed, laps, *load_policy(name))
-    if name == "straighten":
-        return straighten(course, car, speed)
-    known = ", ".join([*DRIVERS, *plan.library()])
-    raise InputError(f"no driver {name}: give one of {known}, a .toml or a commands.csv")
 
 
 INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")

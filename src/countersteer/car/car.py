@@ -1,21 +1,12 @@
 """`Car`: everything that is known about a car, as a frozen pytree of declared parameters."""
 
 import dataclasses
-from typing import NamedTuple
 
-from countersteer.car.parameter import Scalar, choice, count, parameter, pytree
+from countersteer.car.parameter import choice, count, parameter, pytree
+from countersteer.signals import Scalar, Wheels
 
 GRAVITY = 9.81  # m/s²
 COMMONROAD = "CommonRoad vehicle models 3.0.2, tyre of its vehicles"
-
-
-class Wheels(NamedTuple):
-    """One value for each wheel, in the order that the whole project uses."""
-
-    front_left: Scalar
-    front_right: Scalar
-    rear_left: Scalar
-    rear_right: Scalar
 
 
 @pytree

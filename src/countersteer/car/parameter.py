@@ -8,16 +8,13 @@ import difflib
 import math
 import typing
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 
 from countersteer.errors import InputError
+from countersteer.signals import Scalar
 
-# A number: Python's, NumPy's or one that JAX traces; with axes in front, a batch. These have
-# no type in common that arithmetic keeps, so the checker is told nothing.
-Scalar: TypeAlias = Any
-Array: TypeAlias = Any  # the same with one axis or more
 T = typing.TypeVar("T")
 
 # Unit inside -> (suffix of the name at every edge, what one unit outside is inside).

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.parameter import Array, Scalar
 from countersteer.course.course import Course, place
+from countersteer.signals import Array, Scalar
 
 FAR = 1e3  # m to the end of the last leg
 

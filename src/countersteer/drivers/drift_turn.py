@@ -9,16 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car, Lidar
-from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.car.parameter import pytree
 from countersteer.course.along import Legs, legs_of
 from countersteer.course.course import Course
 from countersteer.drivers import policy, straighten
-from countersteer.drivers.driver import Command, Observation, paced
+from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.straighten import Straighten
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
 from countersteer.estimation import lidar_walls
+from countersteer.signals import Array, Command, Scalar
 
 STRAIGHT, SPIN, STOP, SETTLE = 0, 1, 2, 3
 SPEED = 2.0  # m/s, unless another is asked for
@@ -89,6 +90,7 @@ class DriftTurn:
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
     linked: Scalar = 0.0  # 1: a turn begins as soon as the slide of the last ends, walls or not
     longest: Scalar = 1.2  # s that a phase of a turn may take
+    phases = ("straight", "spin", "stop", "settle")
 
     def reset(self, key: jax.Array) -> Memory:
         """Straight ahead, a corridor's length away from the first corner."""
@@ -99,6 +101,11 @@ class DriftTurn:
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
         return paced(self.think, memory, observation)
+
+    def status(self, memory: Memory) -> Status:
+        """The turn and its phase, and where it believes to be in its corridor."""
+        told = self.straight.status(memory.straight)
+        return told._replace(turn=memory.turn, phase=memory.phase, doubts=memory.odds)
 
     def think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
         """The command from now on, and the memory with what is new."""

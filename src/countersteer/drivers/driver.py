@@ -1,17 +1,14 @@
 """What every driver is given and gives back."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from countersteer.car.parameter import Scalar
 from countersteer.estimation.estimate import Estimate
-from countersteer.world.planar import Command
-
-__all__ = ["Command", "Driver", "Heard", "Observation", "paced"]
-
+from countersteer.signals import Command, Scalar
 
 ROUNDING = 2e-5  # s, of a time in 32 bits
 THINKS = 0.005  # s between two thoughts of a driver: as often as gyroscope and estimate have news
@@ -48,12 +45,25 @@ class Observation(NamedTuple):
     estimate: Estimate
 
 
+class Status(NamedTuple):
+    """What a driver says it is about, for records and pages. Nothing is judged by it."""
+
+    turn: Scalar = 0  # turns that it has handed over to
+    phase: Scalar = 0  # of the turn, as the driver's `phases` name them; 0: none
+    offset: Scalar = math.nan  # left of its corridor's middle, as it believes, m
+    angle: Scalar = math.nan  # to the corridor, rad
+    offset_deviation: Scalar = math.inf  # of the two, as far as it says
+    angle_deviation: Scalar = math.inf
+    doubts: Scalar = 0  # readings in a row of the front sonar that it holds for spikes
+
+
 class Driver(Protocol):
     """Made for a course and a nominal car.
 
     A driver that is a pytree (such as one made with `countersteer.car.parameter.pytree`) is traced
-    by JAX: scanned, and batched. Any other object is called from Python, once a control period.
-    A memory may have a field `turn`: how many turns were begun; the record marks turns by it.
+    by JAX: scanned, and batched. Any other object is called from Python, once a control period;
+    it may have a `period` (s), or else decides 200 times a second at most.
+    It may have `status(memory)`, which gives a `Status`: what it is about.
     """
 
     def reset(self, key: jax.Array) -> Any:
@@ -63,6 +73,12 @@ class Driver(Protocol):
     def act(self, memory: Any, observation: Observation) -> tuple[Command, Any]:
         """The command for the next control period, and the memory after it."""
         ...
+
+
+def status_of(driver: Any, memory: Any) -> Status:
+    """What the driver says it is about; nothing where it says none."""
+    found: Status = driver.status(memory) if hasattr(driver, "status") else Status()
+    return found
 
 
 def paced(

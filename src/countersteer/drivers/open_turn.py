@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Scalar, pytree
-from countersteer.drivers.driver import Command, Observation
+from countersteer.car.parameter import pytree
+from countersteer.drivers.driver import Observation, Status
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.drivers.turning import Turning
+from countersteer.signals import Command, Scalar
 
 RUN_UP = 0.3  # s straight ahead before the wheels turn over
 
@@ -66,6 +67,10 @@ class OpenTurn:
             jnp.where(ahead, 0.0, jnp.clip(self.hand * steering, -self.limit, self.limit)),
         )
         return command, Memory(phase, spun, jnp.where(phase == AHEAD, 0, 1))
+
+    def status(self, memory: Memory) -> Status:
+        """The turn, once it has begun."""
+        return Status(memory.turn, memory.phase)
 
 
 def open_turn(

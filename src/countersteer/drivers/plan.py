@@ -17,16 +17,17 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.files import read_toml
-from countersteer.car.parameter import Array, Scalar, pytree, unknown_key
+from countersteer.car.parameter import pytree, unknown_key
 from countersteer.course.along import Line, Place, line_of
 from countersteer.course.course import Course
 from countersteer.drivers import drift_turn
 from countersteer.drivers.drift_turn import DriftTurn
-from countersteer.drivers.driver import Command, Observation, paced
+from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.drivers.straighten import Straighten
 from countersteer.errors import InputError
 from countersteer.estimation import spikes
 from countersteer.estimation.estimate import Estimate
+from countersteer.signals import Array, Command, Scalar
 
 LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
 KINDS = STRAIGHTEN, COMMANDS, DRIFT, CURVE = range(4)
@@ -118,6 +119,10 @@ class Plan:
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One control period."""
         return paced(self._think, memory, observation)
+
+    def status(self, memory: Memory) -> Status:
+        """The turns that it has begun, and where it believes to be in its corridor."""
+        return self.drift.status(memory.drift)._replace(turn=memory.turn)
 
     def _think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
         dt, estimate = seen.time - memory.time, seen.estimate

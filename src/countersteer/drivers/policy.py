@@ -105,7 +105,11 @@ class Policy(NamedTuple):
 
 def load_policy(name: str) -> Policy:
     """A policy from the library or a file. Raises `InputError` naming file, key and range."""
-    tables, where = read_toml(name, LIBRARY, "policy")
+    return policy_of_tables(*read_toml(name, LIBRARY, "policy"))
+
+
+def policy_of_tables(tables: Mapping[str, Any], where: str) -> Policy:
+    """The same from the tables of a file that is called `where`."""
     known = {"kind": 0, "description": 0, "source": 0, **TABLES}
     for key in tables:
         if key not in known:

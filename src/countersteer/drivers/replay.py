@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.parameter import pytree
-from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.driver import Observation
+from countersteer.signals import Command
 
 EARLY = 1e-6  # s by which a command may come early, for times that were rounded
 

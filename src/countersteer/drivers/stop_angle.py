@@ -2,7 +2,8 @@
 
 import jax.numpy as jnp
 
-from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.car.parameter import pytree
+from countersteer.signals import Array, Scalar
 
 
 @pytree

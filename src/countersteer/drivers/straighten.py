@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
-from countersteer.drivers.driver import Command, Observation, paced
+from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.errors import InputError
 from countersteer.estimation.wall_angle import WallAngle, wall_angle
+from countersteer.signals import Array, Command, Scalar
 
 SPEED = 1.5  # m/s, unless another is asked for
 DOUBT = math.radians(0.5)  # of the angle between two corridors
@@ -101,6 +102,16 @@ class Straighten:
             return command, memory._replace(command=command)
 
         return paced(think, memory, observation)
+
+    def status(self, memory: Memory) -> Status:
+        """Where it believes to be in its corridor."""
+        told = Status(memory.turned, 0, memory.offset, memory.error)
+        if self.by == "filter":
+            walls = memory.walls
+            told = told._replace(
+                offset_deviation=walls.offset_deviation, angle_deviation=walls.angle_deviation
+            )
+        return told
 
     def follow(self, memory: Memory, seen: Observation) -> Memory:
         """The memory with what is new: also while something else steers."""

@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 
-from countersteer.car.parameter import Array, Scalar, pytree
-from countersteer.drivers.driver import Command
+from countersteer.car.parameter import pytree
 from countersteer.drivers.stop_angle import interpolate
+from countersteer.signals import Array, Command, Scalar
 
 WEAKEST = 0.5  # part of a servo's gain that is made up for at most
 MOST = 0.3  # rad of sideslip that is made up for at most

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from countersteer.car.car import Battery, Car
-from countersteer.car.parameter import Scalar
 from countersteer.estimation.kalman import Covariance, correct, diagonal, predict
+from countersteer.signals import Scalar
 from countersteer.world import battery as pack
 
 CHARGES = 0.07  # of a full pack's voltage: deviation of the open-circuit voltage at the start

@@ -1,13 +1,15 @@
 """Dead reckoning: gyroscope, accelerometer and wheel encoder, integrated from a known start."""
 
+import dataclasses
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.parameter import Scalar
+from countersteer.car.parameter import pytree
 from countersteer.estimation.estimate import Estimate
-from countersteer.sensing.suite import Readings
+from countersteer.signals import Command, Readings, Scalar
 
 ROLLING = 1.0  # yaw rate (rad/s) under which the wheels are taken to roll, so that they tell speed
 TRUST = 0.25  # part of the difference to the wheels' speed that a report of theirs takes away
@@ -65,3 +67,28 @@ def update(memory: Memory, readings: Readings, dt: float) -> Memory:
         jnp.maximum(readings.accel_x.tick, memory.accelerometer),
         jnp.maximum(readings.wheel_speed.tick, memory.encoder),
     )
+
+
+@pytree
+class DeadReckoning:
+    """Dead reckoning as an `Estimator`, from a known start."""
+
+    start: tuple[Scalar, Scalar, Scalar]  # x, y, heading
+    dt: float = dataclasses.field(metadata={"static": True})
+    name = "reckoning"
+    takes_truth = False
+    period = 0.0
+
+    def init(self, key: jax.Array) -> Memory:
+        """At rest at the start."""
+        del key
+        return initial_memory(self.start, jnp.result_type(self.start[0]))
+
+    def update(self, memory: Memory, readings: Readings, command: Command, tick: Scalar) -> Memory:
+        """Takes in what the readings have that is new."""
+        del command, tick
+        return update(memory, readings, self.dt)
+
+    def estimate(self, memory: Memory) -> Estimate:
+        """What it has come to."""
+        return memory.estimate

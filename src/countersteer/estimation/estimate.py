@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 from countersteer.world.chassis import Symmetric
 
 

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import jax.numpy as jnp
 
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 
 Covariance: TypeAlias = tuple[tuple[Scalar, ...], ...]  # row i holds its columns i, i + 1, ...
 Row: TypeAlias = Mapping[int, Scalar]  # a row of a matrix: its entries that are not zero

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from countersteer.car.car import Lidar
-from countersteer.car.parameter import Array, Scalar
 from countersteer.estimation.kalman import Covariance, correct
 from countersteer.sensing.lidar import bearings
+from countersteer.signals import Array, Scalar
 
 NEAR = 0.15  # m from where a wall is believed to be within which a beam is of it
 AHEAD = math.radians(8)  # from the corridor's direction within which beams look at the wall ahead

@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Sonar
-from countersteer.car.parameter import Scalar, pytree
+from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
+from countersteer.estimation import velocity
 from countersteer.estimation.estimate import Estimate
+from countersteer.estimation.velocity import VelocityFilter
 from countersteer.sensing.sonar import MERGED
-from countersteer.sensing.suite import Reading
+from countersteer.signals import Array, Command, Reading, Readings, Scalar
 from countersteer.world.chassis import Symmetric
 
 HIT = 0.1  # m: error of a distance in a world of rays and straight walls
@@ -26,6 +28,8 @@ NEWS = 0.1  # m to be driven (or a fifth of it in rad turned) until a ping's err
 WALKS = (0.03, 0.03, 0.04)  # beside the filter's: forward, left (m/√s), heading (rad/√s)
 HALF = 0.5  # resampled when the effective number falls below this part of the particles
 NEAR = (0.5, math.radians(30))  # m and rad within which particles are of one hypothesis
+PERIOD = 0.025  # s between two steps of the cloud
+PARTICLES = 500
 ROUGH = (0.01, 0.01, 0.005)  # m, m, rad by which a resampled particle differs from its parent,
 WIDER = 0.04  # and by this part of the whole cloud's deviation, so that a thin cloud searches
 
@@ -57,13 +61,14 @@ class Located(NamedTuple):
 
     cloud: Memory
     pose: Pose
+    tick: Scalar  # of that step
 
 
 @pytree
 class PoseFilter:
     """For a course (walls (n, 4), rows of NaN are padding) and the nominal car's sonar."""
 
-    walls: jax.Array
+    walls: Array
     sonar: Sonar
 
     def uniform(self, course: Course, key: jax.Array, particles: int, motion: Estimate) -> Memory:
@@ -230,6 +235,54 @@ def best(memory: Memory) -> Pose:
         *(jnp.sum(part * a * b) for a, b in ((dx, dy), (dx, dh), (dy, dh))),
     )
     return Pose(x, y, heading, covariance, share)
+
+
+@pytree
+class PoseEstimator:
+    """The pose on a course beside the velocity filter, as an `Estimator`, from a known start."""
+
+    moving: VelocityFilter
+    place: PoseFilter
+    name = "pose"
+    takes_truth = False
+    period = VelocityFilter.period
+
+    @property
+    def every(self) -> int:
+        """Ticks between two steps of the cloud, at least."""
+        return max(1, round(PERIOD / self.moving.dt))
+
+    def init(self, key: jax.Array) -> tuple[velocity.Memory, Located]:
+        """At rest, with the cloud around the start."""
+        memory = self.moving.init(key)
+        known = self.moving.estimate(memory)
+        cloud = self.place.known(self.moving.start, key, PARTICLES, known)
+        return memory, Located(cloud, best(cloud), jnp.int32(-self.every))
+
+    def update(
+        self,
+        memory: tuple[velocity.Memory, Located],
+        readings: Readings,
+        command: Command,
+        tick: Scalar,
+    ) -> tuple[velocity.Memory, Located]:
+        """Both filters at `tick`; the cloud steps when it is due."""
+        moves = self.moving.update(memory[0], readings, command, tick)
+        known = self.moving.estimate(moves)
+
+        since = tick - memory[1].tick
+
+        def step(place: Located) -> Located:
+            h = self.moving.dt * since.astype(place.cloud.x.dtype)
+            cloud = self.place.update(place.cloud, readings.sonar, known, h)
+            return Located(cloud, best(cloud), tick)
+
+        place = jax.lax.cond(since >= self.every, step, lambda same: same, memory[1])
+        return moves, place
+
+    def estimate(self, memory: tuple[velocity.Memory, Located]) -> Estimate:
+        """The velocity filter's, with the pose of the best hypothesis."""
+        return located(memory[1], self.moving.estimate(memory[0]))
 
 
 def located(memory: Located, now: Estimate) -> Estimate:

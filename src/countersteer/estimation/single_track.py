@@ -6,11 +6,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from countersteer.car.car import GRAVITY, Car
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Command, Scalar
 from countersteer.world import drivetrain, motor, servo, tyre
 from countersteer.world.angle import cosine_sine
 from countersteer.world.chassis import Symmetric, Vector, combine, dot, solve
-from countersteer.world.planar import Command, rotated
+from countersteer.world.planar import rotated
 
 
 class Actuators(NamedTuple):

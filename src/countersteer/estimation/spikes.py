@@ -14,8 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.parameter import Scalar
-from countersteer.sensing.suite import Reading
+from countersteer.signals import Reading, Scalar
 
 SLACK = 4.0  # standard deviations of a reading by which it may be too short
 

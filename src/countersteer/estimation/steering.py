@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from countersteer.car.parameter import Scalar
 from countersteer.estimation.kalman import Covariance, correct, diagonal, predict
+from countersteer.signals import Scalar
 
 SERVOS = 0.12  # deviation of the gain at the start, over the nominal servo's
 TRIMS = math.radians(0.6)  # of the trim

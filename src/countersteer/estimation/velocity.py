@@ -11,6 +11,7 @@ A car whose place is told from outside (`sensors.position`) has its place among 
 told is of an instant before, by the sensor's delay, and is compared with where the car was then.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -19,17 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import GRAVITY, Car
-from countersteer.car.parameter import Scalar
+from countersteer.car.parameter import pytree
 from countersteer.estimation import battery, kalman, single_track, steering
 from countersteer.estimation.battery import Pack
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.kalman import Covariance, correct, entry, predict
 from countersteer.estimation.single_track import Actuators
-from countersteer.sensing.suite import Reading, Readings
+from countersteer.signals import Command, Reading, Readings, Scalar
 from countersteer.world import motor
 from countersteer.world.angle import cosine_sine
 from countersteer.world.chassis import Symmetric, Vector
-from countersteer.world.planar import Command, rotated
+from countersteer.world.planar import rotated
 
 # What the nominal car's declaration does not tell: how far the real one may be from it.
 GYRO_BIAS = 0.005  # rad/s, standard deviation
@@ -68,6 +69,7 @@ GYRO_GATE = 6.0  # the same of the gyroscope: a yaw rate changes by jerks
 
 STRAYS = 0.01  # m per root second, by which the place errs beside what the velocity's error makes
 PLACE = 0.1  # m, of the place at the start
+PERIOD = 0.005  # s between two steps
 
 VX, VY, RATE, HEADING, GYRO, AX, AY, ROLLED, X, Y = range(10)  # the last two: where it is told
 
@@ -549,3 +551,28 @@ def estimate(car: Car, memory: Memory, dt: float) -> Estimate:
         ),
         pose,
     )
+
+
+@pytree
+class VelocityFilter:
+    """The filter as an `Estimator`, for the nominal car at a known start."""
+
+    car: Car
+    start: tuple[Scalar, Scalar, Scalar]  # x, y, heading
+    dt: float = dataclasses.field(metadata={"static": True})
+    name = "filter"
+    takes_truth = False
+    period = PERIOD
+
+    def init(self, key: jax.Array) -> Memory:
+        """At rest at the start."""
+        del key
+        return initial_memory(self.car, self.start, jnp.result_type(self.car.body.mass))
+
+    def update(self, memory: Memory, readings: Readings, command: Command, tick: Scalar) -> Memory:
+        """The filter at `tick`, with what the readings have that is new."""
+        return update(self.car, memory, readings, command, tick, self.dt)
+
+    def estimate(self, memory: Memory) -> Estimate:
+        """What the filter believes."""
+        return estimate(self.car, memory, self.dt)

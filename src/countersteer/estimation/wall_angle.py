@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car, Lidar
-from countersteer.car.parameter import Scalar, pytree
+from countersteer.car.parameter import pytree
 from countersteer.estimation import lidar_walls
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.kalman import Covariance, correct, diagonal, entry, predict
-from countersteer.sensing.suite import Reading
+from countersteer.signals import Reading, Scalar
 
 OFFSET, ANGLE, BIAS = range(3)
 START = (0.1, 0.05, 0.005)  # standard deviations at the start: m, rad, rad/s

@@ -10,9 +10,9 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
+from countersteer.signals import Command
 from countersteer.simulator import keep_programs
 from countersteer.world import planar
-from countersteer.world.planar import Command
 
 DURATION = 1.0  # s
 FINEST = 2e-5  # s, of the solution that counts as converged

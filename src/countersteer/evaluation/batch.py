@@ -18,9 +18,9 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
 from countersteer.car.car import Car
+from countersteer.signals import Command
 from countersteer.simulator import compiler_flags
 from countersteer.world import planar
-from countersteer.world.planar import Command
 from countersteer.world.state import State
 
 LANES = 256  # cars of a block: enough for the loops' overhead, few enough for the caches

@@ -119,12 +119,12 @@ class Fleet:
         import jax
         import jax.numpy as jnp
 
-        from countersteer.car.car import Wheels
         from countersteer.car.files import load_car
         from countersteer.course.files import load_course
         from countersteer.evaluation import batch
-        from countersteer.simulator import padded
+        from countersteer.signals import Wheels
         from countersteer.world import planar
+        from countersteer.world.walls import padded
 
         self.dt = dt
         self.cars = cars = batch.spread(cars, block or batch.LANES, cores)
@@ -231,14 +231,16 @@ def drive_side(size: Size) -> Iterator[dict[str, Any]]:
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.drivers.drift_turn import drift_turn
+    from countersteer.pilot import Pilot
     from countersteer.simulator import PIECE, Simulator
 
     course, car = load_course("box"), load_car("rx7")
-    simulator = Simulator(course, car, drift_turn(course, car, laps=1000))
-    pieces = simulator.run(1e6)
+    simulator = Simulator.of(course, car)
+    pilot = Pilot.of(drift_turn(course, car, laps=1000), course, car)
+    pieces = simulator.run(pilot, 1e6)
     for _ in range(4):
         next(pieces)
-    act, memory, seen = thinking(simulator)
+    act, memory, seen = thinking(simulator, pilot)
     yield {}
     while True:
         yield {
@@ -247,20 +249,17 @@ def drive_side(size: Size) -> Iterator[dict[str, Any]]:
         }
 
 
-def thinking(simulator: Any) -> tuple[Any, Any, Any]:
+def thinking(simulator: Any, pilot: Any) -> tuple[Any, Any, Any]:
     """A driver's `act`, compiled, with a memory and an observation at which it thinks."""
     import jax
     import jax.numpy as jnp
 
-    from countersteer.simulator import jitted_observe
-
     with jax.enable_x64(True):
-        plan = simulator.plan()
-        around, loop = simulator.begin(plan)
-        _, seen = jitted_observe(plan, around, loop)
+        loop, memory = simulator.init(), pilot.init(simulator.root)
+        _, seen = jax.jit(type(pilot).observe)(pilot, memory, simulator.readings(loop), loop.tick)
         seen = seen._replace(time=jnp.asarray(1.0))
-        act = jax.jit(simulator.driver.act).lower(loop.memory, seen).compile()
-        return act, *jax.tree.map(jnp.asarray, (loop.memory, seen))
+        act = jax.jit(pilot.driver.act).lower(memory.driver, seen).compile()
+        return act, *jax.tree.map(jnp.asarray, (memory.driver, seen))
 
 
 def native_side(size: Size) -> Iterator[dict[str, Any]]:

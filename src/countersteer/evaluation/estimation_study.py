@@ -28,12 +28,13 @@ from countersteer.drivers.straighten import lane, straighten
 from countersteer.estimation.pose import PoseFilter
 from countersteer.evaluation.evaluate import Trials, interval, results
 from countersteer.evaluation.population import Drawn, draw, load_population
-from countersteer.evaluation.rollout import LATE, LOOK, LOST, REACHED, STALLED, TOUCHED, Score
 from countersteer.evaluation.watches import FIT, PARTICLES, SAMPLE, Errors, Places, anywhere
 from countersteer.link.link import ONBOARD
 from countersteer.sensing.faults import KINDS, Fault
-from countersteer.simulator import keep_programs, padded
+from countersteer.simulator import keep_programs
+from countersteer.task.task import PERIOD, Outcome, Score
 from countersteer.world import battery
+from countersteer.world.walls import padded
 
 SET, SPEEDS, COURSES = "around", (1.5, 3.0), ("box", "ess")
 CARS = 256  # of each course
@@ -73,7 +74,8 @@ def rms(values: Any) -> float:
 def errors(course: Course, car: Car, seeds: Sequence[int], make: Make = drift_turn) -> Any:
     """Scores, and what `watches.Errors` has kept, of one drive for each seed."""
     lines = jax.tree.map(np.float32, lane(course))
-    watch = Errors(lane=lines, inside=np.float32(chi2.ppf(0.95, 3)))
+    sonar = jax.tree.map(np.float32, car.sensors.sonar)
+    watch = Errors(lane=lines, sonar=sonar, inside=np.float32(chi2.ppf(0.95, 3)))
     return trials(course, car, seeds).watched(partial(make, course, car), watch)
 
 
@@ -98,7 +100,7 @@ def figures(of: Trials, kept: Any) -> dict[str, float]:
     means = np.mean(kept.squares[:, timed], axis=0)
     return {
         "drives": len(each),
-        "drifting_s": LOOK * float(np.sum(kept.drifting)),
+        "drifting_s": PERIOD * float(np.sum(kept.drifting)),
         "sideslip_deg": math.degrees(per(kept.slip, kept.drifting)),
         "reckoned_deg": math.degrees(per(kept.reckoned, kept.drifting)),
         "normalised": float(np.nanmean(each)),
@@ -270,9 +272,9 @@ def failing(
     shape = (len(pairs), cars, count)
     which, car_number, straight = (axis.ravel() for axis in np.indices(shape))
     score = run(which, begins[car_number, straight], seeds[car_number])
-    status = score.status.reshape(shape)
+    status = score.outcome.reshape(shape)
     found = {pair: status[i] for i, pair in enumerate(pairs)}
-    return found | {("none", ""): np.repeat(sound.status[:, None], count, axis=1)}
+    return found | {("none", ""): np.repeat(sound.outcome[:, None], count, axis=1)}
 
 
 def sensor_faults(car: Car, cars: int) -> list[str]:
@@ -281,8 +283,11 @@ def sensor_faults(car: Car, cars: int) -> list[str]:
     lines = ["| sensor | " + " | ".join(KINDS) + " |", "| --- |" + " ---: |" * len(KINDS)]
 
     def say(status: np.ndarray) -> str:
-        goal, stops = np.sum(status == REACHED), np.sum((status == STALLED) | (status == LATE))
-        touched, lost = np.sum(status == TOUCHED), np.sum(status == LOST)
+        goal, stops = (
+            np.sum(status == Outcome.REACHED.code),
+            np.sum((status == Outcome.STALLED.code) | (status == Outcome.LATE.code)),
+        )
+        touched, lost = np.sum(status == Outcome.TOUCHED.code), np.sum(status == Outcome.LOST.code)
         rest = f", {stops} stop" if stops else ""
         rest += f", **{touched} touch**" if touched else ""
         rest += f", **{lost} lost**" if lost else ""
@@ -293,7 +298,7 @@ def sensor_faults(car: Car, cars: int) -> list[str]:
         lines.append(f"| {sensor.replace('_', ', ')} | {told} |")
         print(lines[-1], flush=True)
         for kind in KINDS:
-            touched = np.argwhere(found[sensor, kind] == TOUCHED)
+            touched = np.argwhere(found[sensor, kind] == Outcome.TOUCHED.code)
             if len(touched):
                 print(" ", kind, "seed and straight:", touched.tolist(), flush=True)
     lines.append(f"| none | {say(found['none', ''][:, :1])} | | |")
@@ -386,7 +391,7 @@ def draw_picture(squares: dict[str, np.ndarray], path: Path) -> None:
     for one, (name, table) in zip(np.atleast_1d(axes), squares.items(), strict=True):
         number = np.sum(np.isfinite(table), axis=0)
         many = number >= len(table) / 2
-        time, count = LOOK * SAMPLE * np.arange(table.shape[1])[many], number[many]
+        time, count = PERIOD * SAMPLE * np.arange(table.shape[1])[many], number[many]
         bounds = chi2.ppf(np.array([[0.025], [0.975]]), 3 * count) / count
         one.fill_between(time, *bounds, alpha=0.25, label="95 % bounds of the mean")
         one.plot(time, np.nanmean(table[:, many], axis=0), ".-", markersize=3, label="mean")

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from scipy.stats import binomtest
 
@@ -14,10 +13,11 @@ from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.evaluation.population import Population, draw
-from countersteer.evaluation.rollout import LANES, REACHED, STATUS, Score, Watch, watched
+from countersteer.evaluation.rollout import LANES, Watch, watched
 from countersteer.link.link import Link
+from countersteer.pilot import Pilot
 from countersteer.sensing.faults import Fault
-from countersteer.simulator import Simulator
+from countersteer.task.task import Outcome, Score
 
 DRIFT = math.radians(25)  # sideslip that makes a turn a drift
 CONFIDENCE = 0.95
@@ -64,19 +64,11 @@ class Trials:
         else:
             made = {speed: make(speed) for speed in set(drawn.speed.tolist())}
             drivers = [made[speed] for speed in drawn.speed.tolist()]
-        car = jax.tree.map(np.float32, self.car)
-        simulator = Simulator(
-            self.course,
-            car,
-            drivers[0],
-            self.link,
-            self.estimate,
-            self.dt,
-            nominal=self.nominal,
-        )
+        pilot = Pilot.of(drivers[0], self.course, self.nominal, self.estimate, self.link, self.dt)
         longest = 3.0 + (self.course.lap_end(self.laps) or 0.0) / SLOWEST
         return watched(
-            simulator,
+            self.course,
+            pilot,
             drawn,
             drivers,
             self.seeds,
@@ -86,6 +78,7 @@ class Trials:
             report,
             lanes,
             faults,
+            self.link,
         )
 
     def about(self) -> dict[str, Any]:
@@ -110,7 +103,7 @@ def interval(successes: int, trials: int) -> tuple[float, float]:
 
 def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
     """What came of a driver's trials; names and units are those of the JSON."""
-    won, turns = score.status == REACHED, score.turns
+    won, turns = score.outcome == Outcome.REACHED.code, score.turns
     count, trials = int(np.sum(won)), len(seeds)
     drifts = np.all(turns.peak_sideslip > DRIFT, axis=1)
     errors = np.degrees(turns.error[won])
@@ -131,8 +124,8 @@ def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
         "lap_time_s_median": median(score.goal_time[won]),
         "failed_seeds": [int(seed) for seed in numbers[~won]],
         "failures": {
-            STATUS[code]: [int(seed) for seed in numbers[score.status == code]]
-            for code in np.unique(score.status[~won])
+            Outcome.of(code).value: [int(seed) for seed in numbers[score.outcome == code]]
+            for code in np.unique(score.outcome[~won])
         },
     }
 
@@ -171,7 +164,7 @@ def picture(scores: Mapping[str, Score], title: str, path: Path) -> None:
 
     figure, (errors, slips, laps) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
     for name, score in scores.items():
-        won, turns = score.status == REACHED, score.turns
+        won, turns = score.outcome == Outcome.REACHED.code, score.turns
         if not np.any(won):
             continue
         drawn = {"histtype": "step", "linewidth": 1.5, "label": name}

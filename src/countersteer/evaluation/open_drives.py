@@ -16,15 +16,16 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Array
-from countersteer.drivers.driver import Command, Driver, Heard, Observation
+from countersteer.drivers.driver import Driver, Heard, Observation
 from countersteer.drivers.replay import Replay
 from countersteer.estimation.estimate import Estimate
-from countersteer.evaluation.rollout import LANES, LOOK
-from countersteer.simulator import padded
+from countersteer.evaluation.rollout import LANES
+from countersteer.signals import Array, Command, Motion
+from countersteer.task.task import PERIOD
 from countersteer.world import planar
 from countersteer.world.floor import Floor
-from countersteer.world.state import Motion, State
+from countersteer.world.state import State
+from countersteer.world.walls import padded
 
 PIECE = 100  # samples of a call, whatever the length of the drives
 DT = 0.001  # s
@@ -64,7 +65,7 @@ def drives(
     report: Callable[[int, int], None] = lambda *_: None,
     lanes: int = LANES,
 ) -> Sampled:
-    """One drive of `longest` seconds for each driver, sampled each `LOOK` seconds.
+    """One drive of `longest` seconds for each driver, sampled each `PERIOD` seconds.
 
     `velocity` (drives, 3) is vx, vy and yaw rate at the start, at which the wheels roll, and `pose`
     (drives, 3) x, y and heading; `walls` are (n, 4), for all. Leaves of `cars` and `floor` have an
@@ -77,7 +78,7 @@ def drives(
     around = padded(np.zeros((0, 4)) if walls is None else walls, dtype)
     mesh = Mesh(np.array(jax.devices()), ("core",))
     count, width = len(drivers), lanes * mesh.size
-    pieces, kept = math.ceil(longest / (PIECE * LOOK)), round(longest / LOOK)
+    pieces, kept = math.ceil(longest / (PIECE * PERIOD)), round(longest / PERIOD)
     slots = planar.delay_slots(cars, DT)
     blocks = []
     for first in range(0, count, width):
@@ -86,7 +87,7 @@ def drives(
         loop = _start(mesh, slots, block)
         records = []
         for piece in range(pieces):
-            tick = np.int32(piece * PIECE * round(LOOK / DT))
+            tick = np.int32(piece * PIECE * round(PERIOD / DT))
             loop, record = _piece(mesh, around, block, loop, tick)
             records.append(jax.tree.map(lambda leaf, n=rows: np.asarray(leaf)[:n], record))
             report(first * pieces + (piece + 1) * rows, count * pieces)
@@ -94,7 +95,7 @@ def drives(
             jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :kept], *records)
         )
     return Sampled(
-        LOOK * np.arange(kept), *jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+        PERIOD * np.arange(kept), *jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
     )
 
 
@@ -119,7 +120,7 @@ def _start(mesh: Mesh, slots: int, block: Any) -> Any:
 @partial(jax.jit, static_argnums=0)
 def _piece(mesh: Mesh, walls: Any, block: Any, loop: Any, tick: Any) -> Any:
     """The next `PIECE` samples: the motion at each, and the command that is asked for then."""
-    every = round(LOOK / DT)
+    every = round(PERIOD / DT)
 
     def one(walls: Any, own: Lanes, loop: Any) -> Any:
         def next_tick(carry: Any, count: Any) -> Any:

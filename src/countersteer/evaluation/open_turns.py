@@ -18,9 +18,9 @@ from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
 from countersteer.evaluation.open_drives import batch, drives
 from countersteer.evaluation.population import Population, draw
-from countersteer.evaluation.turns import sideslip
 from countersteer.runs.files import Table, read_table
 from countersteer.runs.run import Run, drawn_car, read_run
+from countersteer.task.turns import sideslip
 from countersteer.tuning.windows import find_references, read_measured
 
 ON, OFF = 0.05, 0.02  # throttle that drives, and throttle that does not

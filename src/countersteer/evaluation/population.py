@@ -11,9 +11,10 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.files import read_toml
-from countersteer.car.parameter import Array, Declaration, changed, declarations, unknown_key
+from countersteer.car.parameter import Declaration, changed, declarations, unknown_key
 from countersteer.course.course import Course
 from countersteer.errors import InputError
+from countersteer.signals import Array
 from countersteer.world import floor
 from countersteer.world.floor import LARGEST, Floor
 

@@ -22,6 +22,7 @@ from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
 from countersteer.drivers.replay import Replay
 from countersteer.evaluation.drive import about_run, drive
+from countersteer.pilot import Pilot
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run, read_run
 from countersteer.simulator import Simulator, keep_programs
@@ -70,10 +71,10 @@ def log(car: Car, folder: Path, rng: np.random.Generator) -> Run:
     steering = np.append(0.0, np.radians(rng.uniform(-25, 25, len(times) - 1)))
     seed = int(rng.integers(2**31))
     driver = Replay(times=times, throttle=throttle, steering=steering)
-    simulator = Simulator(None, car, driver, seed=seed)
-    about = about_run(simulator, "replay", BASE, 1)
+    simulator, pilot = Simulator.of(None, car, seed=seed), Pilot.of(driver, None, car)
+    about = about_run(simulator, pilot, None, "replay", BASE, 1, car, {"kind": "replay"})
     folder.mkdir()
-    drive(simulator, folder, about, 1, DURATION, lambda *_: None)
+    drive(simulator, pilot, None, folder, about, 1, DURATION)
     return measured(read_run(folder), float(car.sensors.encoder.update), rng)
 
 

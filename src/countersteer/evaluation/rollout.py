@@ -3,10 +3,9 @@
 Each lane is a trial: its own car, start, noise and driver's numbers. Trials run in blocks, a block
 on each core, in pieces of car time; between pieces those that are over make room for the rest. A
 trial ends when its goal is reached and its last turn has ended, or when it can no longer succeed.
-What is judged, and when, is as `turns` judges a recorded drive (a test holds the two together).
 """
 
-import math
+import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -17,148 +16,21 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Array, Scalar
-from countersteer.course.along import Line, line_of
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
 from countersteer.evaluation.population import Drawn
-from countersteer.evaluation.turns import (
-    LONGEST,
-    SLOW,
-    STRAIGHT_FOR,
-    STRAIGHT_RATE,
-    STRAIGHT_SLIP,
-    Judge,
-)
-from countersteer.sensing import sonar, suite
+from countersteer.link.link import ONBOARD, Link
+from countersteer.pilot import Memory, Pilot
+from countersteer.sensing import suite
 from countersteer.sensing.faults import Fault
-from countersteer.simulator import Loop, Plan, Simulator, Surroundings, begin, padded, tick
+from countersteer.signals import Array, Scalar
+from countersteer.simulator import Loop, Simulator, begin, tick
+from countersteer.task.task import PERIOD, Outcome, Sample, Score, Task
 from countersteer.world import planar
 from countersteer.world.floor import Floor
-from countersteer.world.state import State
 
 LANES, FEW = 128, 16  # trials of a block; where there are no more, of a smaller one
-LOOK = 0.005  # s between two samples that are judged, as in truth.csv
-
-DRIVING, REACHED, TOUCHED, ROLLED, STALLED, LOST, LATE = range(7)
-STATUS = (
-    "driving", "goal reached", "touched a wall", "rolled over", "stalled", "lost its state",
-    "out of time",
-)  # fmt: skip
-
-
-class Way(NamedTuple):
-    """The centre line, and what the judge must know of the course."""
-
-    line: Line
-    goal: Scalar
-    bearings: Array  # (turns,) heading of the corridor behind each turn
-
-
-class Turns(NamedTuple):
-    """What is known of each turn; arrays of one number a turn. Times are inf until they come."""
-
-    begin: Array
-    end: Array
-    stirred: Array  # 1 once the car has not gone straight in it
-    calm_since: Array
-    entry_speed: Array
-    peak_sideslip: Array
-    peak_yaw_rate: Array
-    error: Array  # heading less the corridor's, at the end
-
-
-class Score(NamedTuple):
-    """A trial so far."""
-
-    status: Scalar
-    distance: Scalar
-    furthest: Scalar
-    furthest_at: Scalar
-    goal_time: Scalar
-    stirred_at: Scalar
-    turns: Turns
-
-
-def way_of(course: Course, laps: int, dtype: Any) -> Way:
-    """The way between start and goal as arrays."""
-    bearings = course.start[2] + np.cumsum([t.angle for t in course.turns_ahead(laps)])
-    goal = np.asarray(course.lap_end(laps), dtype)
-    return Way(line_of(course, dtype), goal, np.asarray(bearings, dtype))
-
-
-def initial_score(course: Course, turns: int, dtype: Any) -> Score:
-    """Before the first sample."""
-    distance = dtype(course.start_distance)
-    never, zero = np.full(turns, np.inf, dtype), np.zeros(turns, dtype)
-    table = Turns(never, never, zero, zero, zero, zero, zero, zero)
-    inf = dtype(np.inf)
-    return Score(np.int32(DRIVING), distance, distance, dtype(0), inf, dtype(0), table)
-
-
-def follow(way: Way, score: Score, state: State, turn: Scalar, time: Scalar) -> Score:
-    """The score with one sample more; a trial that is over stays as it is."""
-    motion = state.motion
-    speed = jnp.sqrt(motion.vx**2 + motion.vy**2 + 1e-12)
-    slip = jnp.where(speed > SLOW, jnp.abs(jnp.arctan2(motion.vy, motion.vx)), 0.0)
-    rate = jnp.abs(motion.yaw_rate)
-    calm = (rate < STRAIGHT_RATE) & (slip < STRAIGHT_SLIP)
-
-    distance = way.line.follow(motion.x, motion.y, score.distance).distance
-    ahead = distance > score.furthest + 0.05
-    goal_time = jnp.where(
-        jnp.isinf(score.goal_time) & (distance >= way.goal), time, score.goal_time
-    )
-    stirred_at = jnp.where(calm, score.stirred_at, time)
-
-    old = score.turns
-    number = jnp.arange(old.begin.shape[0])
-    begins = jnp.isinf(old.begin) & (number < turn)
-    begin = jnp.where(begins, time, old.begin)
-    under_way = (begin <= time) & jnp.isinf(old.end)
-    stirred = jnp.where(under_way & ~calm, 1.0, old.stirred)
-    calm_since = jnp.where(calm & ~begins, old.calm_since, time)
-    late = time - begin >= LONGEST - 1e-4
-    settled = (stirred > 0) & calm & (time - calm_since >= STRAIGHT_FOR - 1e-4)
-    ends = under_way & (late | settled)
-    error = motion.heading - way.bearings
-    error = error - 2 * math.pi * jnp.round(error / (2 * math.pi))
-    turns = Turns(
-        begin,
-        jnp.where(ends, time, old.end),
-        stirred,
-        calm_since,
-        jnp.where(begins, speed, old.entry_speed),
-        jnp.where(under_way, jnp.maximum(old.peak_sideslip, slip), old.peak_sideslip),
-        jnp.where(under_way, jnp.maximum(old.peak_yaw_rate, rate), old.peak_yaw_rate),
-        jnp.where(ends, error, old.error),
-    )
-    reached = ~jnp.isinf(goal_time) & (
-        (time - stirred_at >= STRAIGHT_FOR - 1e-4) | (time - goal_time >= LONGEST)
-    )
-    furthest_at = jnp.where(ahead, time, score.furthest_at)
-    stalled = jnp.isinf(goal_time) & (time - furthest_at > Judge.STALLED)
-    status = jnp.int32(DRIVING)
-    for found, name in (
-        (stalled, STALLED),
-        (reached, REACHED),
-        (state.rolled_over > 0, ROLLED),
-        (state.wall_contacts > 0, TOUCHED),
-        (~jnp.isfinite(motion.x + motion.vx + motion.yaw_rate), LOST),
-    ):
-        status = jnp.where(found, jnp.int32(name), status)
-    new = Score(
-        status,
-        distance,
-        jnp.where(ahead, distance, score.furthest),
-        furthest_at,
-        goal_time,
-        stirred_at,
-        turns,
-    )
-    over = score.status != DRIVING
-    return jax.tree.map(lambda a, b: jnp.where(over, a, b), score, new)
 
 
 class Trials(NamedTuple):
@@ -176,13 +48,9 @@ class Trials(NamedTuple):
 class Shared(NamedTuple):
     """What all trials share."""
 
-    walls: Array
-    corners: Array
-    loss: Scalar
-    nominal: Car  # the one that the filter knows
-    start: tuple[Scalar, Scalar, Scalar]  # the one that the driver believes
-    way: Way
-    score: Score  # before the first sample
+    simulator: Simulator  # the one whose parts the trials' own take the place of
+    pilot: Pilot  # the same, of its driver
+    task: Task
     ticks: Scalar  # at most
     watch: Any = None
 
@@ -190,14 +58,22 @@ class Shared(NamedTuple):
 class Watch(Protocol):
     """What looks on at trials beside the judge, in pytrees; a pytree itself, all trials share it.
 
-    What it keeps of a trial is looked at every `LOOK`, before the judge's sample is taken.
+    What it keeps of a trial is looked at every `PERIOD`, before the judge's sample is taken.
     """
 
-    def begin(self, around: Surroundings, loop: Loop) -> Any:
+    def begin(self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory) -> Any:
         """What is kept before the first tick."""
         ...
 
-    def look(self, plan: Plan, around: Surroundings, loop: Loop, score: Score, kept: Any) -> Any:
+    def look(
+        self,
+        simulator: Simulator,
+        pilot: Pilot,
+        loop: Loop,
+        memory: Memory,
+        score: Score,
+        kept: Any,
+    ) -> Any:
         """What is kept with this instant; of no effect when the trial is over."""
         ...
 
@@ -206,10 +82,8 @@ class Watch(Protocol):
         ...
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _rollout(
-    mesh: Mesh, plan: Plan, shared: Shared, varied: Trials, driver: Any
-) -> tuple[Score, Any]:
+@partial(jax.jit, static_argnums=0)
+def _rollout(mesh: Mesh, shared: Shared, varied: Trials, driver: Any) -> tuple[Score, Any]:
     """A block of trials on each core; `driver` holds None where the trials' drivers differ."""
     cut, same = PartitionSpec("core"), PartitionSpec()
 
@@ -218,7 +92,7 @@ def _rollout(
             mine = jax.tree.map(
                 lambda a, b: b if a is None else a, driver, own.driver, is_leaf=lambda x: x is None
             )
-            return _trial(plan, shared, own._replace(driver=mine))
+            return _trial(shared, own._replace(driver=mine))
 
         return jax.vmap(one, axis_name="trial")(varied)
 
@@ -228,97 +102,95 @@ def _rollout(
     return run(shared, varied, driver)
 
 
-def _trial(plan: Plan, shared: Shared, own: Trials) -> tuple[Score, Any]:
+def _trial(shared: Shared, own: Trials) -> tuple[Score, Any]:
     """One trial; a block goes on until all its trials are over."""
-    every = max(1, round(LOOK / plan.dt))
-    key, driver_key = jax.random.split(jax.random.key(own.seed))
-    known = (shared.loss, shared.nominal, own.floor, own.faults)
-    around = Surroundings(shared.walls, shared.corners, key, *known)
-    zero = jnp.zeros_like(own.charge)
-    pose = (own.pose[0], own.pose[1], own.pose[2])
-    still = (zero, zero, zero)
-    loop = begin(
-        plan,
-        own.car,
-        around,
-        own.driver,
-        pose,
-        shared.start,
-        still,
-        own.charge,
-        driver_key,
+    task, watch = shared.task, shared.watch
+    world: Any = shared.simulator.world
+    simulator = dataclasses.replace(
+        shared.simulator,
+        world=dataclasses.replace(world, car=own.car, floor=own.floor),
+        pose=(own.pose[0], own.pose[1], own.pose[2]),
+        velocity=(jnp.zeros_like(own.charge),) * 3,
+        charge=own.charge,
+        seed=own.seed,
+        faults=own.faults,
     )
+    pilot = dataclasses.replace(shared.pilot, driver=own.driver)
+    every = max(1, round(PERIOD / simulator.dt))
+    loop, memory = begin(simulator), pilot.init(simulator.root)
 
-    def one(loop: Loop, _: None) -> tuple[Loop, None]:
-        return tick(plan, own.car, around, own.driver, loop)[0], None
+    def one(carry: tuple[Loop, Memory], _: None) -> tuple[tuple[Loop, Memory], None]:
+        after = tick(simulator, pilot, *carry)
+        return after[:2], None
 
-    watch = shared.watch
-    kept = () if watch is None else watch.begin(around, loop)
+    kept = () if watch is None else watch.begin(simulator, pilot, loop, memory)
 
-    def look(carry: tuple[Loop, Score, Scalar, Any]) -> tuple[Loop, Score, Scalar, Any]:
-        loop, score, _, kept = carry
+    def look(carry: tuple[Loop, Memory, Score, Scalar, Any]) -> Any:
+        loop, memory, score, _, kept = carry
         if watch is not None:
-            told = watch.look(plan, around, loop, score, kept)
-            live = score.status == DRIVING
+            told = watch.look(simulator, pilot, loop, memory, score, kept)
+            live = score.outcome == Outcome.DRIVING.code
             kept = jax.tree.map(lambda new, old: jnp.where(live, new, old), told, kept)
-        time = plan.dt * loop.tick.astype(score.distance.dtype)
-        turn = jnp.asarray(getattr(loop.memory, "turn", 0))
-        score = follow(shared.way, score, loop.state, turn, time)
-        loop, _ = jax.lax.scan(one, loop, None, length=every)
+        time = simulator.dt * loop.tick.astype(score.distance.dtype)
+        motion, events = simulator.world.motion(loop.state), simulator.world.events(loop.state)
+        turn = jnp.asarray(pilot.status(memory).turn)
+        score = task.update(score, Sample(time, motion, *events, turn))
+        (loop, memory), _ = jax.lax.scan(one, (loop, memory), None, length=every)
         # Common to the block, so that the loop's end is.
-        going = jax.lax.pmax((score.status == DRIVING).astype(jnp.int32), "trial")
-        return loop, score, going, kept
+        going = jax.lax.pmax((score.outcome == Outcome.DRIVING.code).astype(jnp.int32), "trial")
+        return loop, memory, score, going, kept
 
-    def goes_on(carry: tuple[Loop, Score, Scalar, Any]) -> Any:
-        return (carry[2] > 0) & (carry[0].tick <= shared.ticks)
+    def goes_on(carry: tuple[Loop, Memory, Score, Scalar, Any]) -> Any:
+        return (carry[3] > 0) & (carry[0].tick <= shared.ticks)
 
-    first = (loop, shared.score, jnp.int32(1), kept)
-    loop, score, _, kept = jax.lax.while_loop(goes_on, look, first)
-    late = score.status == DRIVING
-    return score._replace(status=jnp.where(late, jnp.int32(LATE), score.status)), (
+    first = (loop, memory, task.init(), jnp.int32(1), kept)
+    _, _, score, _, kept = jax.lax.while_loop(goes_on, look, first)
+    late = score.outcome == Outcome.DRIVING.code
+    return score._replace(outcome=jnp.where(late, jnp.int32(Outcome.LATE.code), score.outcome)), (
         () if watch is None else watch.end(kept)
     )
 
 
 def watched(
-    simulator: Simulator,
+    course: Course,
+    pilot: Pilot,
     drawn: Drawn,
     drivers: Sequence[Driver],
     seeds: Sequence[int],
     laps: int,
     longest: float,
-    watch: Watch | None,
+    watch: Watch | None = None,
     report: Callable[[int, int], None] = lambda *_: None,
     lanes: int | None = None,
     faults: tuple[Fault, ...] = (),
+    link: Link = ONBOARD,
 ) -> tuple[Score, Any]:
     """One trial for each seed, its driver and what was drawn for it; and what `watch` has kept.
 
-    `simulator` says how: course, link, step, estimate; its car is the nominal one. In the precision
-    of the leaves of `drawn`. Leaves of `faults` and of the result have an axis of trials in front.
+    `pilot` says how it is driven, but by whom. In the precision of the leaves of `drawn`. Leaves
+    of `faults` and of the result have an axis of trials in front.
     """
-    course = simulator.course
-    if course is None or course.goal_distance is None:
+    if course.goal_distance is None:
         raise InputError("trials need a course with a goal")
     dtype = np.asarray(drawn.charge).dtype
-    slots = planar.delay_slots(drawn.cars, simulator.dt)
-    told = suite.position_slots(drawn.cars, simulator.dt)
-    plan = simulator.plan()._replace(slots=slots, told=told, fails=bool(faults))
-    walls = padded(course.walls, dtype)
-    way = way_of(course, laps, dtype)
-    start = initial_score(course, len(way.bearings), dtype.type)
-    shared = Shared(
-        walls,
-        sonar.edges(walls),
-        dtype.type(simulator.link.loss),
-        jax.tree.map(dtype.type, simulator.nominal or simulator.car),
-        tuple(map(dtype.type, course.start)),
-        way,
-        start,
-        np.int32(round(longest / simulator.dt)),
-        watch,
+    first: Any = jax.tree.map(lambda leaf: leaf[0], drawn)
+    simulator = Simulator.of(course, first.cars, link=link, dt=pilot.dt, floor=first.floor)
+    world: Any = dataclasses.replace(  # type: ignore[type-var]  # planar
+        simulator.world, slots=planar.delay_slots(drawn.cars, pilot.dt)
+    )
+    simulator = dataclasses.replace(
+        _without(simulator, "pose", "velocity", "charge", "seed"),
+        world=_without(world, "car", "floor"),
+        slots=suite.position_slots(drawn.cars, pilot.dt),
     )
     common, own = _common(drivers, dtype)
+    shared = Shared(
+        simulator,
+        _without(pilot.typed(dtype), "driver"),
+        Task.of(course, laps, walls_end=True, dtype=dtype),
+        np.int32(round(longest / pilot.dt)),
+        watch,
+    )
     varied = Trials(
         drawn.cars,
         own,
@@ -332,18 +204,19 @@ def watched(
     count = len(seeds)
     width = (lanes or (FEW if count <= FEW * mesh.size else LANES)) * mesh.size
     found = []
-    for first in range(0, count, width):
-        picked = np.arange(first, first + width) % count
+    for first_row in range(0, count, width):
+        picked = np.arange(first_row, first_row + width) % count
         with jax.enable_x64(dtype == np.float64):
-            results = _rollout(mesh, plan, shared, _rows(varied, picked), common)
-        found.append(_rows(results, np.arange(min(width, count - first))))
-        report(min(first + width, count), count)
+            results = _rollout(mesh, shared, _rows(varied, picked), common)
+        found.append(_rows(results, np.arange(min(width, count - first_row))))
+        report(min(first_row + width, count), count)
     whole: tuple[Score, Any] = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
     return whole
 
 
 def rollouts(
-    simulator: Simulator,
+    course: Course,
+    pilot: Pilot,
     drawn: Drawn,
     drivers: Sequence[Driver],
     seeds: Sequence[int],
@@ -351,9 +224,17 @@ def rollouts(
     longest: float,
     report: Callable[[int, int], None] = lambda *_: None,
     lanes: int | None = None,
+    link: Link = ONBOARD,
 ) -> Score:
     """`watched` with nobody looking on."""
-    return watched(simulator, drawn, drivers, seeds, laps, longest, None, report, lanes)[0]
+    return watched(
+        course, pilot, drawn, drivers, seeds, laps, longest, None, report, lanes, link=link
+    )[0]
+
+
+def _without(tree: Any, *names: str) -> Any:
+    """The tree without parts that each trial has of its own."""
+    return dataclasses.replace(tree, **dict.fromkeys(names))
 
 
 def _rows(tree: Any, picked: np.ndarray) -> Any:

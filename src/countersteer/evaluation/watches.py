@@ -11,14 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer import streams
+from countersteer.car.car import Sonar
+from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import STRAIGHT
 from countersteer.drivers.straighten import Lane
 from countersteer.estimation import dead_reckoning, pose, spikes
 from countersteer.estimation.estimate import Estimate
-from countersteer.evaluation.rollout import LOOK, Score
-from countersteer.simulator import LOCATING, Loop, Plan, Surroundings, observe
+from countersteer.pilot import Memory, Pilot
+from countersteer.signals import Array, Scalar
+from countersteer.simulator import Loop, Simulator, heard
+from countersteer.streams import Stream
+from countersteer.task.task import PERIOD, Score
 from countersteer.world.chassis import Vector, dot, solve
 
 SLIPS = math.radians(10)  # sideslip from which on the car drifts
@@ -64,13 +69,15 @@ class Errors:
     """Errors of what the driver is told, in a loop whose estimate is the velocity filter."""
 
     lane: Lane
+    sonar: Sonar  # the nominal car's
     inside: Scalar  # 95 % of a chi-squared distribution with three degrees of freedom
 
-    def begin(self, around: Surroundings, loop: Loop) -> Kept:
+    def begin(self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory) -> Kept:
         """Nothing yet."""
-        del around
-        dtype = jnp.result_type(loop.state.motion.x)
-        zero, m = jnp.zeros((), dtype), loop.state.motion
+        del pilot, memory
+        m = simulator.world.motion(loop.state)
+        dtype = jnp.result_type(m.x)
+        zero = jnp.zeros((), dtype)
         told = jax.tree.map(lambda _: zero, Estimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
         none: list[Any] = [zero] * len(Kept._fields)
         return Kept(*none)._replace(
@@ -81,11 +88,19 @@ class Errors:
             spike=spikes.initial_memory(np.dtype(dtype)),
         )
 
-    def look(self, plan: Plan, around: Surroundings, loop: Loop, score: Score, kept: Kept) -> Kept:
+    def look(
+        self,
+        simulator: Simulator,
+        pilot: Pilot,
+        loop: Loop,
+        memory: Memory,
+        score: Score,
+        kept: Kept,
+    ) -> Kept:
         """One instant more."""
         del score
-        motion = loop.state.motion
-        _, seen = observe(plan, around, loop)
+        motion, dt = simulator.world.motion(loop.state), simulator.dt
+        _, seen = pilot.observe(memory, heard(simulator, loop), loop.tick)
         told = jax.tree.map(lambda value: jnp.asarray(value, motion.charge.dtype), seen.estimate)
         time = seen.time
         warm = time > WARM
@@ -93,7 +108,7 @@ class Errors:
         slip = jnp.arctan2(motion.vy, motion.vx)
         fast = motion.vx**2 + motion.vy**2 > FASTER**2
         drifts = jnp.where(warm & fast & (jnp.abs(slip) > SLIPS), 1.0, 0.0)
-        reckoning = dead_reckoning.update(kept.reckoning, loop.readings, plan.dt)
+        reckoning = dead_reckoning.update(kept.reckoning, loop.readings, dt)
 
         def square(other: Estimate) -> Scalar:
             off = other.sideslip - slip
@@ -102,34 +117,30 @@ class Errors:
         off = Vector(told.vx - motion.vx, told.vy - motion.vy, told.yaw_rate - motion.yaw_rate)
         normal = dot(off, solve(told.velocity_covariance, off))
         looked = jnp.where(warm, 1.0, 0.0)
-        number = loop.tick // round(LOOK / plan.dt)
+        number = loop.tick // round(PERIOD / dt)
         place = jnp.minimum(number // SAMPLE, SAMPLES - 1)
         fills = warm & (number % SAMPLE == 0)
         squares = kept.squares.at[place].set(jnp.where(fills, normal, kept.squares[place]))
 
-        turn = jnp.asarray(getattr(loop.memory, "turn", 0))
-        own = getattr(loop.memory, "straight", loop.memory)
-        phase = getattr(loop.memory, "phase", STRAIGHT)
-        offset, angle, _ = self.lane.place(turn, motion)
-        straight = jnp.where(warm & (phase == STRAIGHT) & (jnp.abs(angle) < 0.3), 1.0, 0.0)
-        offset_error, angle_error = (own.offset - offset) ** 2, (own.error - angle) ** 2
-        variances = (jnp.inf, jnp.inf)
-        if own.walls != ():
-            variances = own.walls.offset_deviation**2, own.walls.angle_deviation**2
+        own = pilot.status(memory)
+        offset, angle, _ = self.lane.place(jnp.asarray(own.turn), motion)
+        goes_on = own.phase == STRAIGHT
+        straight = jnp.where(warm & goes_on & (jnp.abs(angle) < 0.3), 1.0, 0.0)
+        offset_error, angle_error = (own.offset - offset) ** 2, (own.angle - angle) ** 2
+        variances = (own.offset_deviation**2, own.angle_deviation**2)
 
-        sonar, front = around.nominal.sensors.sonar, loop.readings.sonar[0]
-        expected = pose.PoseFilter(walls=around.walls, sonar=sonar).expected(
+        front = loop.readings.sonar[0]
+        expected = pose.PoseFilter(walls=simulator.walls, sonar=self.sonar).expected(
             *(jnp.reshape(value, (1,)) for value in (motion.x, motion.y, motion.heading))
         )[0][0]
         came = (front.tick > kept.spike.tick) & jnp.isfinite(front.value) & warm
         fits = jnp.abs(front.value - expected) < FIT
         sound, stray = came & fits, came & (front.value < expected - FIT)
         speed = jnp.sqrt(motion.vx**2 + motion.vy**2)
-        spike = spikes.update(kept.spike, front, LOOK * speed, sonar.noise)
+        spike = spikes.update(kept.spike, front, PERIOD * speed, self.sonar.noise)
         held = spike.believed != front.value
         # The driver has heard by now what came at the last look.
-        odd = getattr(loop.memory, "odds", 0) > 0
-        doubted = (kept.sound > 0) & odd & (phase == STRAIGHT)
+        doubted = (kept.sound > 0) & (own.doubts > 0) & goes_on
 
         one = lambda true: jnp.where(true, 1.0, 0.0)  # noqa: E731  # used five times
         return Kept(
@@ -191,13 +202,16 @@ class Places:
     turns: Array  # (places,) rad
     particles: int = dataclasses.field(default=PARTICLES, metadata={"static": True})
 
-    def begin(self, around: Surroundings, loop: Loop) -> tuple[pose.Memory, Placed]:
+    def begin(
+        self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory
+    ) -> tuple[pose.Memory, Placed]:
         """Anywhere; each trial with noise of its own."""
-        zero = jnp.zeros_like(loop.state.motion.x)
-        still = Estimate(zero, zero, loop.state.motion.heading, zero, zero, zero)
-        key = jax.random.fold_in(around.key, 9)
+        motion = simulator.world.motion(loop.state)
+        zero = jnp.zeros_like(motion.x)
+        still = Estimate(zero, zero, motion.heading, zero, zero, zero)
+        key = streams.key(simulator.root, Stream.WATCH)
         none = jnp.full_like(self.turns, jnp.inf)
-        still = still._replace(heading=loop.estimate.mean[3])
+        still = still._replace(heading=pilot.estimator.estimate(memory.estimate).heading)
         picked = jax.random.randint(key, (self.particles,), 0, len(self.uniform[0]))
         x, y, heading = (jnp.asarray(value)[picked] for value in self.uniform)
         cloud = self.place.memory(x, y, heading, _slim(still), key)
@@ -205,21 +219,22 @@ class Places:
 
     def look(
         self,
-        plan: Plan,
-        around: Surroundings,
+        simulator: Simulator,
+        pilot: Pilot,
         loop: Loop,
+        memory: Memory,
         score: Score,
         kept: tuple[pose.Memory, Placed],
     ) -> tuple[pose.Memory, Placed]:
         """One instant more: the cloud steps at its own period."""
-        every = round(LOCATING / plan.dt)
+        every = round(pose.PERIOD / simulator.dt)
 
         def step(kept: tuple[pose.Memory, Placed]) -> tuple[pose.Memory, Placed]:
             cloud, placed = kept
-            _, seen = observe(plan, around, loop)
-            cloud = self.place.update(cloud, loop.readings.sonar, _slim(seen.estimate), LOCATING)
+            _, seen = pilot.observe(memory, heard(simulator, loop), loop.tick)
+            cloud = self.place.update(cloud, loop.readings.sonar, _slim(seen.estimate), pose.PERIOD)
             best = pose.best(cloud)
-            motion = loop.state.motion
+            motion = simulator.world.motion(loop.state)
             cosine, sine = jnp.cos(self.turns), jnp.sin(self.turns)
             dx, dy = motion.x - self.middle[0], motion.y - self.middle[1]
             x = self.middle[0] + cosine * dx - sine * dy

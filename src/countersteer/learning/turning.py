@@ -19,8 +19,9 @@ from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.policy import TABLES, Policy
 from countersteer.evaluation.population import Population, draw
-from countersteer.evaluation.rollout import REACHED, Score, rollouts
-from countersteer.simulator import Simulator
+from countersteer.evaluation.rollout import rollouts
+from countersteer.pilot import Pilot
+from countersteer.task.task import Outcome, Score
 
 SPEEDS = (1.5, 2.0, 2.5, 3.0)  # m/s asked for, by turns
 SLOWEST = 1.1  # m/s: a trial that takes longer is lost
@@ -62,7 +63,7 @@ class Generation(NamedTuple):
 
 def cost(score: Score) -> np.ndarray:
     """Of each trial: failure, sideslip that is missing or too much, and heading errors squared."""
-    turns, won = score.turns, score.status == REACHED
+    turns, won = score.turns, score.outcome == Outcome.REACHED.code
     ended = np.isfinite(turns.end)
     done = ended.sum(axis=1)
     slip, error = np.degrees(turns.peak_sideslip), np.abs(np.degrees(turns.error))
@@ -105,7 +106,7 @@ def search(
         policies = [shaped(begin, numbers) for numbers in tried]
         score = drive(courses[number % len(courses)], car, population, policies, seeds)
         costs = cost(score).reshape(candidates, trials).mean(axis=1)
-        won = np.mean(score.status[:trials] == REACHED)
+        won = np.mean(score.outcome[:trials] == Outcome.REACHED.code)
         elite = tried[np.argsort(costs)[:best]]
         report(number, Generation(float(costs[0]), float(won), float(costs.min())))
         about = np.sqrt(weights @ (elite - mean) ** 2)
@@ -131,9 +132,9 @@ def drive(
     ]
     rows = np.tile(np.arange(len(seeds)), len(policies))
     many: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], drawn)
-    simulator = Simulator(course, jax.tree.map(np.float32, car), drivers[0])
+    pilot = Pilot.of(drivers[0], course, car)
     longest = (course.lap_end(1) or 0.0) / SLOWEST
-    return rollouts(simulator, many, drivers, [seeds[i] for i in rows], 1, longest)
+    return rollouts(course, pilot, many, drivers, [seeds[i] for i in rows], 1, longest)
 
 
 def _numbers(policy: Policy) -> list[tuple[str, Any]]:

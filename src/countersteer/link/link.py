@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.parameter import Array, Scalar
+from countersteer.signals import Array, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +23,30 @@ class Link:
     loss: float = 0.0  # chance that a packet is lost, either way
     timeout: float = math.inf  # a car that hears nothing for so long stops
 
+    def in_ticks(self, dt: float) -> "Ticks":
+        """The same in whole ticks of dt seconds, at least one each."""
+
+        def ticks(time: float) -> int:
+            return max(1, round(time / dt))
+
+        return Ticks(
+            ticks(self.control_period),
+            ticks(self.telemetry_period),
+            round(self.delay / dt),
+            0 if math.isinf(self.timeout) else ticks(self.timeout),
+            self.onboard,
+        )
+
+
+class Ticks(NamedTuple):
+    """A link's times in ticks; hashable, as a program is compiled for them."""
+
+    control: int  # between two commands
+    telemetry: int
+    delay: int
+    timeout: int  # 0: none
+    onboard: bool
+
 
 # Rates: paper, II.E. Delay, loss and timeout of the radio: assumed.
 ONBOARD = Link("onboard", control_period=0.001, telemetry_period=0.005, onboard=True)
@@ -30,7 +54,7 @@ RADIO = Link("radio", 0.1, 0.03, onboard=False, delay=0.02, loss=0.05, timeout=0
 LINKS = {link.name: link for link in (ONBOARD, RADIO)}
 
 
-class Channel(NamedTuple):
+class Packets(NamedTuple):
     """One direction of a radio: packets on their way, and the last one that arrived."""
 
     packets: Any  # a pytree whose leaves have a slot a packet in front
@@ -39,30 +63,28 @@ class Channel(NamedTuple):
     arrived: Scalar  # tick of the last arrival; -1 before the first
 
 
-def initial_channel(packet: Any, period: int, delay: int) -> Channel:
-    """A channel with nothing on its way; `packet` is what its far end assumes until it hears."""
+def initial_packets(packet: Any, period: int, delay: int) -> Packets:
+    """Nothing on its way; `packet` is what its far end assumes until it hears."""
     slots = delay // period + 2
     packets = jax.tree.map(lambda leaf: np.stack([leaf] * slots), packet)
-    return Channel(packets, np.ones(slots, bool), packet, np.int32(-1))
+    return Packets(packets, np.ones(slots, bool), packet, np.int32(-1))
 
 
 def exchange(
-    channel: Channel, packet: Any, lost: Scalar, tick: Scalar, period: int, delay: int
-) -> Channel:
+    air: Packets, packet: Any, lost: Scalar, tick: Scalar, period: int, delay: int
+) -> Packets:
     """One tick: sends `packet` where one is due, and delivers the one that is due."""
-    slots = channel.lost.shape[0]
+    slots = air.lost.shape[0]
     sends = tick % period == 0
     into = (tick // period) % slots
     packets = jax.tree.map(
         lambda line, new: line.at[into].set(jnp.where(sends, new, line[into])),
-        channel.packets,
+        air.packets,
         packet,
     )
-    lost_line = channel.lost.at[into].set(jnp.where(sends, lost, channel.lost[into]))
+    lost_line = air.lost.at[into].set(jnp.where(sends, lost, air.lost[into]))
     sent = tick - delay
     out = (sent // period) % slots
     arrives = (sent >= 0) & (sent % period == 0) & ~lost_line[out]
-    latest = jax.tree.map(
-        lambda line, old: jnp.where(arrives, line[out], old), packets, channel.latest
-    )
-    return Channel(packets, lost_line, latest, jnp.where(arrives, tick, channel.arrived))
+    latest = jax.tree.map(lambda line, old: jnp.where(arrives, line[out], old), packets, air.latest)
+    return Packets(packets, lost_line, latest, jnp.where(arrives, tick, air.arrived))

@@ -20,11 +20,9 @@ from countersteer.errors import InputError
 from countersteer.runs.files import (
     COMMANDS,
     Table,
-    column_rows,
-    command_rows,
     read_table,
 )
-from countersteer.runs.writer import RunWriter, new_folder
+from countersteer.runs.recorder import Recorder, new_folder
 
 FULL_LOCK = 25.0  # degrees of the front wheels that a steering of 1 nominally asks for
 
@@ -122,15 +120,15 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
     folder = new_folder(out / log.stem, log.stem)
     steering = np.radians(FULL_LOCK * updates["steering"])
     headers = {"commands": COMMANDS, "telemetry": tuple(telemetry)}
-    cells = {
-        "commands": command_rows(updates["time_s"], throttle, steering),
-        "telemetry": column_rows(telemetry.values()),
+    tables = {
+        "commands": (updates["time_s"], throttle, steering),
+        "telemetry": tuple(telemetry.values()),
     }
     if found.truth is not None:
         headers["truth"] = tuple(found.truth)
-        cells["truth"] = column_rows(found.truth.values())
-    with RunWriter(folder, about, headers) as writer:
-        writer.write(cells)
+        tables["truth"] = tuple(found.truth.values())
+    with Recorder(folder, about, headers) as recorder:
+        recorder.write(tables)
     return {"run": str(folder), "duration_s": float(updates["time_s"][-1]), **about}
 
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from countersteer.errors import InputError
-from countersteer.runs.files import COMMANDS, column_rows, command_rows
-from countersteer.runs.writer import RunWriter, new_folder
+from countersteer.runs.files import COMMANDS
+from countersteer.runs.recorder import Recorder, new_folder
 
 FULL_LOCK = 36.0  # degrees of the front wheels that a steering of 1 nominally asks for
 
@@ -84,12 +84,12 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
     }
     folder = new_folder(out / log.stem, log.stem)
     truth = {name: column[~repeated] for name, column in truth.items()}
-    cells = {
-        "commands": command_rows(time, throttle, np.radians(FULL_LOCK * steering)),
-        "truth": column_rows(truth.values()),
+    tables = {
+        "commands": (time, throttle, np.radians(FULL_LOCK * steering)),
+        "truth": tuple(truth.values()),
     }
-    with RunWriter(folder, about, {"commands": COMMANDS, "truth": tuple(truth)}) as writer:
-        writer.write(cells)
+    with Recorder(folder, about, {"commands": COMMANDS, "truth": tuple(truth)}) as recorder:
+        recorder.write(tables)
     return {"run": str(folder), "duration_s": float(time[-1]), **about}
 
 

@@ -15,21 +15,6 @@ from countersteer.text import read_text
 log = logging.getLogger(__name__)
 
 COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
-TRUTH = (
-    "time_s",
-    "x_m",
-    "y_m",
-    "heading_rad",
-    "vx_mps",
-    "vy_mps",
-    "yaw_rate_radps",
-    "wheel_fl_radps",
-    "wheel_fr_radps",
-    "wheel_rl_radps",
-    "wheel_rr_radps",
-    "steering_rad",
-    "battery_v",
-)
 LARGEST_STEERING = 90.0  # degrees
 
 

@@ -1,6 +1,7 @@
 """`Run`: the record of one drive, read from its folder."""
 
 import dataclasses
+import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ class Run:
     commands: Table  # time_s, throttle (negative in reverse), steering (rad)
     telemetry: Table | None
     truth: Table | None
+    summary: dict[str, Any] = dataclasses.field(default_factory=dict)  # summary.json
 
     @property
     def car(self) -> Car | None:
@@ -51,6 +53,17 @@ def drawn_car(about: Mapping[str, Any]) -> Car:
     return load_car(name if name in library() else "rx7")
 
 
+def read_summary(path: Path) -> dict[str, Any]:
+    """A `summary.json`. Raises `InputError` where it is none."""
+    try:
+        found = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: not valid JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: must hold one JSON object")
+    return found
+
+
 def read_run(path: Path) -> Run:
     """A run's folder. Raises `InputError` where it is not one."""
     if not path.is_dir():
@@ -61,11 +74,12 @@ def read_run(path: Path) -> Run:
         about = tomllib.loads(read_text(path / "run.toml"))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}/run.toml: not valid TOML: {error}") from None
-    telemetry, truth = path / "telemetry.csv", path / "truth.csv"
+    telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
     return Run(
         path,
         about,
         read_commands(path / "commands.csv"),
         read_table(telemetry, ("time_s",)) if telemetry.exists() else None,
         read_table(truth, ("time_s", "x_m", "y_m", "heading_rad")) if truth.exists() else None,
+        read_summary(summary) if summary.exists() else {},
     )

@@ -7,23 +7,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from countersteer import streams
 from countersteer.car.car import Car
-from countersteer.car.parameter import Array, Scalar, pytree
+from countersteer.car.parameter import pytree
 from countersteer.errors import InputError
-from countersteer.sensing.suite import POSITION, Reading, Readings
+from countersteer.sensing.suite import channels
+from countersteer.signals import Array, Channel, Reading, Readings, Scalar, flat, pairs, unflat
+from countersteer.streams import Stream
 
 KINDS = ("dead", "stuck", "spike")
-FIELDS = {
-    "encoder": ("counts", "wheel_speed"),
-    "gyroscope": ("gyroscope",),
-    "accelerometer": ("accel_x", "accel_y"),
-    "voltmeter": ("battery",),
-    "line_detector": ("line_crossings", "line_speed"),
-    "lidar": ("lidar",),
-    "position": POSITION,
-}
-LARGEST_COUNT = 65535  # of a counter of 16 bits
-FASTEST = 20.0  # m/s that a wheel or the lines may seem to tell
 ASTRAY = 10.0  # m by which a place may seem to be off
 
 
@@ -35,7 +27,7 @@ class Fault:
     each is a number drawn evenly from all that such a sensor may tell (a place: from 10 m around).
     """
 
-    sensor: str = field(metadata={"static": True})  # `sonar`, one as `sonar_<mount>`, or of FIELDS
+    sensor: str = field(metadata={"static": True})  # as its `Channel` has it; `sonar`: all of them
     kind: str = field(metadata={"static": True})  # of KINDS
     start: Scalar  # s
     duration: Scalar  # s; inf: for good
@@ -43,14 +35,8 @@ class Fault:
 
 def check(faults: tuple[Fault, ...], car: Car) -> None:
     """Raises `InputError` where the car has no such sensor, or where there is no such fault."""
-    part = car.sensors
-    off = {
-        "line_detector": part.line_detector.lines == "none",
-        "lidar": part.lidar.beams == 0,
-        "position": part.position.reports == "none",
-    }
-    mounts = ("sonar", *(f"sonar_{mount}" for mount in part.sonar.mount_names))
-    known = (*(mounts if len(mounts) > 1 else ()), *(n for n in FIELDS if not off.get(n)))
+    sensors = [channel.sensor for channel in flat(channels(car))]
+    known = list(dict.fromkeys((*(["sonar"] if car.sensors.sonar.mounts else []), *sensors)))
     for fault in faults:
         if fault.sensor not in known:
             raise InputError(f"fault: the car's sensors are {', '.join(known)}, not {fault.sensor}")
@@ -63,29 +49,22 @@ def report(
     car: Car,
     last: Readings,
     now: Readings,
-    key: jax.Array,
+    root: jax.Array,
     tick: Scalar,
     dt: float,
 ) -> Readings:
     """What is reported after a tick whose readings are `now`, where `last` was reported before it.
 
-    Only readings taken in this tick change anything. Spikes are drawn from `key` and `tick`.
+    Only readings taken in this tick change anything. Spikes are drawn from the drive's key `root`.
     """
-    key = jax.random.fold_in(jax.random.fold_in(key, tick), 8)
-    time, mounts = tick * dt, car.sensors.sonar.mount_names
-    cases: list[tuple[str, tuple[str, ...], Reading, Reading]] = [
-        ("sonar", ("sonar", f"sonar_{mount}"), old, new)
-        for mount, old, new in zip(mounts, last.sonar, now.sonar, strict=True)
-    ]
-    for sensor, names in FIELDS.items():
-        for name in names:
-            if getattr(now, name) is not None:
-                cases.append((name, (sensor,), getattr(last, name), getattr(now, name)))
-    told = []
-    for i, (name, sensors, old, new) in enumerate(cases):
+    key = streams.key(root, Stream.FAULTS, tick)
+    time, told = tick * dt, []
+    for i, ((channel, old), new) in enumerate(
+        zip(pairs(channels(car), last), flat(now), strict=True)
+    ):
         result = new
         for j, fault in enumerate(faults):
-            if fault.sensor in sensors:
+            if fault.sensor == channel.sensor or fault.sensor == channel.sensor.split("_")[0]:
                 lasts = (time > fault.start - dt / 2) & (
                     time < fault.start + fault.duration - dt / 2
                 )
@@ -93,38 +72,24 @@ def report(
                 failed = {
                     "dead": old,
                     "stuck": old._replace(tick=new.tick),
-                    "spike": new._replace(value=spike(car, name, new.value, own)),
+                    "spike": new._replace(value=spike(channel, new.value, own)),
                 }[fault.kind]
                 result = _choice(lasts, failed, result)
         told.append(_choice(new.tick == tick, result, old))
-    others: dict[str, Any] = {case[0]: new for case, new in zip(cases, told, strict=True)}
-    return now._replace(**others | {"sonar": tuple(told[: len(mounts)])})
+    return unflat(now, told)
 
 
 def _choice(condition: Scalar, a: Reading, b: Reading) -> Reading:
     return Reading(*(jnp.where(condition, *both) for both in zip(a, b, strict=True)))
 
 
-def spike(car: Car, name: str, value: Array, key: jax.Array) -> Array:
-    """A reading at random in place of `value`, from the range of its field of `Readings`."""
-    sensors, count = car.sensors, (0.0, float(LARGEST_COUNT))
-    low, high = {
-        "sonar": (sensors.sonar.nearest, sensors.sonar.reach),
-        "counts": count,
-        "wheel_speed": (0.0, FASTEST),
-        "gyroscope": (-sensors.gyroscope.reach, sensors.gyroscope.reach),
-        "accel_x": (-sensors.accelerometer.reach, sensors.accelerometer.reach),
-        "accel_y": (-sensors.accelerometer.reach, sensors.accelerometer.reach),
-        "battery": (0.0, 2 * car.battery.full),
-        "line_crossings": count,
-        "line_speed": (0.0, FASTEST),
-        "lidar": (0.0, sensors.lidar.reach),
-        "position_x": (value - ASTRAY, value + ASTRAY),
-        "position_y": (value - ASTRAY, value + ASTRAY),
-        "position_heading": (-math.pi, math.pi),
-    }[name]
+def spike(channel: Channel, value: Array, key: jax.Array) -> Array:
+    """A reading at random in place of `value`, from the channel's range, or from 10 m around."""
+    low, high = channel.low, channel.high
+    if isinstance(low, float) and math.isinf(low):  # else it may be traced
+        low, high = value - ASTRAY, value + ASTRAY
     drawn = jax.random.uniform(key, jnp.shape(value), value.dtype, low, high)
-    return jnp.round(drawn) if name in ("counts", "line_crossings") else drawn
+    return jnp.round(drawn) if channel.whole else drawn
 
 
 def read_fault(text: str) -> Fault:

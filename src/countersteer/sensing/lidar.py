@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from countersteer.car.car import Lidar
-from countersteer.car.parameter import Array, Scalar
 from countersteer.sensing.parts import quantised
+from countersteer.signals import Array, Scalar
 
 SEAM = 1e-5  # m by which a wall is taken to be longer, so that no beam slips between two
 

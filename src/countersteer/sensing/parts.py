@@ -10,9 +10,8 @@ from countersteer.car.car import (
     LineDetector,
     Position,
     Voltmeter,
-    Wheels,
 )
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar, Wheels
 
 
 def quantised(value: Scalar, step: Scalar) -> Scalar:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from countersteer.car.car import Sonar
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 
 PAST = 1e-5  # rad by which a ray passes the end of a wall
 INSIDE = 1e-3  # m of a wall that must show, for it to return an echo

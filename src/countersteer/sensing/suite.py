@@ -1,5 +1,6 @@
 """All sensors of a car on the shared clock."""
 
+import math
 from fractions import Fraction
 from functools import partial
 from typing import Any, NamedTuple
@@ -8,39 +9,56 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from countersteer import streams
 from countersteer.car.car import Car
-from countersteer.car.parameter import Array, Scalar
 from countersteer.sensing import lidar, parts, sonar
+from countersteer.signals import Array, Channel, Motion, Reading, Readings, Scalar
+from countersteer.streams import Stream
 from countersteer.world import drivetrain, motor
 from countersteer.world.chassis import Vector
-from countersteer.world.state import Motion
 
 POSITION = ("position_x", "position_y", "position_heading")
+LARGEST_COUNT = 65535.0  # of a counter of 16 bits
+FASTEST = 20.0  # m/s that a wheel or the lines may seem to tell
 
 
-class Reading(NamedTuple):
-    """A sensor's last report; `tick` is -1 until there was one."""
+def channels(car: Car) -> Readings:
+    """What the car reports: a `Channel` in place of each reading. The car may be traced."""
+    part, inf, pi = car.sensors, math.inf, math.pi
+    near, far, volts = part.sonar.nearest, part.sonar.reach, 2 * car.battery.full
+    spin, push = part.gyroscope.reach, part.accelerometer.reach
+    found: dict[str, Any] = {
+        "sonar": tuple(
+            Channel(f"sonar_{name}_m", "m", near, far, "distance; inf: no echo", f"sonar_{name}")
+            for name in part.sonar.mount_names
+        )
+    }
 
-    value: Scalar
-    tick: Scalar
+    def add(field: str, sensor: str, *about: Any, **more: Any) -> None:
+        found[field] = Channel(*(*about, sensor), **more)
 
-
-class Readings(NamedTuple):
-    """The last report of every sensor. SI units, radians."""
-
-    sonar: tuple[Reading, ...]  # m, in the order of the car's mounts; inf: no echo
-    counts: Reading  # regions passed since the start
-    wheel_speed: Reading  # m/s, never negative
-    gyroscope: Reading  # rad/s
-    accel_x: Reading  # m/s²
-    accel_y: Reading
-    battery: Reading  # V
-    line_crossings: Reading | None = None  # lines entered since the start; None: no line detector
-    line_speed: Reading | None = None  # m/s, their spacing over the time since the last one
-    lidar: Reading | None = None  # (beams,), m, from right to left; inf: no echo; None: no lidar
-    position_x: Reading | None = None  # m; None: no such sensor
-    position_y: Reading | None = None
-    position_heading: Reading | None = None  # rad; None: the sensor tells no heading
+    counts, meaning = (0.0, LARGEST_COUNT), "regions of the disc passed, blind to direction"
+    add("counts", "encoder", "encoder_counts", "1", *counts, meaning, whole=True)
+    add("wheel_speed", "encoder", "wheel_speed_mps", "m/s", 0.0, FASTEST, "speed of the wheel")
+    add("gyroscope", "gyroscope", "gyro_radps", "rad/s", -spin, spin, "yaw rate")
+    for axis, way in (("x", "forward"), ("y", "to the left")):
+        about = (f"accel_{axis}_mps2", "m/s2", -push, push, f"acceleration {way}")
+        add(f"accel_{axis}", "accelerometer", *about)
+    add("battery", "voltmeter", "battery_v", "V", 0.0, volts, "voltage under load")
+    if part.line_detector.lines != "none":
+        add("line_crossings", "line_detector", "line_crossings", "1", *counts, "lines", whole=True)
+        about = ("line_speed_mps", "m/s", 0.0, FASTEST, "speed from line to line")
+        add("line_speed", "line_detector", *about)
+    if part.lidar.beams:
+        about = ("lidar_m", "m", 0.0, part.lidar.reach, "distances, right to left; inf: no echo")
+        add("lidar", "lidar", *about, shape=(part.lidar.beams,))
+    if part.position.reports != "none":
+        for axis in ("x", "y"):
+            about = (f"position_{axis}_m", "m", -inf, inf, f"place along the world's {axis}")
+            add(f"position_{axis}", "position", *about)
+    if part.position.reports == "pose":
+        add("position_heading", "position", "position_heading_rad", "rad", -pi, pi, "heading")
+    return Readings(**found)
 
 
 class Periods(NamedTuple):
@@ -108,14 +126,15 @@ def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None
     zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
     no_echo = none._replace(value=dtype(np.inf))
     sensors = car.sensors
-    readings = Readings(tuple(no_echo for _ in sensors.sonar.mounts), *[none] * 6)
+    silent: Any = (tuple(no_echo for _ in sensors.sonar.mounts), *[none] * 6)
+    readings = Readings(*silent)
     eye, poses, part = None, None, sensors.line_detector
     if part.lines != "none":
         readings = readings._replace(line_crossings=none, line_speed=none)
         eye = parts.eye(part, motion.x, motion.heading)
     if sensors.lidar.beams:
-        silent = np.full(sensors.lidar.beams, np.inf, dtype)
-        readings = readings._replace(lidar=none._replace(value=silent))
+        no_echoes = np.full(sensors.lidar.beams, np.inf, dtype)
+        readings = readings._replace(lidar=none._replace(value=no_echoes))
     if sensors.position.reports != "none":
         readings = readings._replace(position_x=none, position_y=none)
         if sensors.position.reports == "pose":
@@ -133,19 +152,19 @@ def sense(
     corners: jax.Array,
     memory: Memory,
     motion: Motion,
-    key: jax.Array,
+    root: jax.Array,
     tick: Scalar,
     every: Periods,
     dt: float,
 ) -> Memory:
-    """The sensors after a tick. Noise is drawn from `key` and `tick`, once a reading."""
+    """The sensors after a tick. Noise is drawn once a reading, from the drive's key `root`."""
     sensors, readings = car.sensors, memory.readings
     shaft = drivetrain.driven_speed(car, motion.wheels)
     speed = parts.disc_speed(sensors.encoder, motion.wheels, shaft)
     turned = memory.disc + dt * parts.regions_per_second(sensors.encoder, speed)
     passed = jnp.floor(turned)
     memory = memory._replace(disc=turned - passed, counts=memory.counts + jnp.abs(passed))
-    key = jax.random.fold_in(key, tick)
+    own = partial(streams.key, root, tick=tick)
     dtype = jnp.result_type(motion.x)
 
     def ping(readings: Readings) -> Readings:
@@ -156,9 +175,7 @@ def sense(
         else:
             fires = (jnp.asarray(1.0),) * mounts
         pose = (motion.x, motion.y, motion.heading)
-        found = sonar.distances(
-            sensors.sonar, walls, corners, pose, fires, jax.random.fold_in(key, 4)
-        )
+        found = sonar.distances(sensors.sonar, walls, corners, pose, fires, own(Stream.SONAR))
         return readings._replace(
             sonar=tuple(
                 Reading(
@@ -169,13 +186,13 @@ def sense(
         )
 
     def turn(readings: Readings) -> Readings:
-        noise = jax.random.normal(jax.random.fold_in(key, 1), dtype=dtype)
+        noise = jax.random.normal(own(Stream.GYROSCOPE), dtype=dtype)
         return readings._replace(
             gyroscope=Reading(parts.gyroscope(sensors.gyroscope, motion.yaw_rate, noise), tick)
         )
 
     def weigh(readings: Readings) -> Readings:
-        noise = jax.random.normal(jax.random.fold_in(key, 2), (2,), dtype=dtype)
+        noise = jax.random.normal(own(Stream.ACCELEROMETER), (2,), dtype=dtype)
         time = (tick - jnp.maximum(readings.accel_x.tick, 0)) * dt
         # The mean since the last report, of the turning too: else a turn that begins is felt early.
         before = memory.velocity
@@ -199,7 +216,7 @@ def sense(
         )
 
     def probe(readings: Readings) -> Readings:
-        noise = jax.random.normal(jax.random.fold_in(key, 3), dtype=dtype)
+        noise = jax.random.normal(own(Stream.VOLTMETER), dtype=dtype)
         voltage = motor.drive(
             car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, shaft
         ).battery_voltage
@@ -209,22 +226,21 @@ def sense(
 
     def scan(readings: Readings) -> Readings:
         pose = (motion.x, motion.y, motion.heading)
-        noise = jax.random.normal(jax.random.fold_in(key, 5), (sensors.lidar.beams,), dtype)
+        noise = jax.random.normal(own(Stream.LIDAR), (sensors.lidar.beams,), dtype)
         return readings._replace(
             lidar=Reading(lidar.ranges(sensors.lidar, walls, pose, noise), tick)
         )
 
     def locate(readings: Readings) -> Readings:
-        noise = jax.random.normal(jax.random.fold_in(key, 6), (3,), dtype)
+        noise = jax.random.normal(own(Stream.POSITION), (3,), dtype)
         assert memory.poses is not None
         told = parts.position(sensors.position, memory.poses[(tick + 1) % len(memory.poses)], noise)
-        return readings._replace(
-            **{
-                name: Reading(value, tick)
-                for name, value in zip(POSITION, told, strict=True)
-                if getattr(readings, name) is not None
-            }
-        )
+        new: dict[str, Any] = {
+            name: Reading(value, tick)
+            for name, value in zip(POSITION, told, strict=True)
+            if getattr(readings, name) is not None
+        }
+        return readings._replace(**new)
 
     counted, weighed = due(every.encoder, tick), due(every.accelerometer, tick)
     reports = [

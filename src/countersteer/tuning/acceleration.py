@@ -29,17 +29,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.car import Car, Wheels
-from countersteer.car.parameter import Array, Scalar, changed, declarations
+from countersteer.car.car import Car
+from countersteer.car.parameter import changed, declarations
 from countersteer.errors import InputError
 from countersteer.runs import faults
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 from countersteer.sensing import parts
+from countersteer.signals import Array, Command, Scalar, Wheels
 from countersteer.tuning.speed import TO_DEVIATION, read_speed
 from countersteer.tuning.windows import asked
 from countersteer.world import drivetrain, planar
-from countersteer.world.planar import Command
 
 PARAMETER = "motor.resistance"
 DURATION = 1.0  # s of each step, the paper's

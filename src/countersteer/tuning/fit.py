@@ -26,10 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Array, Declaration, changed, declarations
+from countersteer.car.parameter import Declaration, changed, declarations
 from countersteer.errors import InputError
 from countersteer.runs.faults import Fault
 from countersteer.runs.run import Run
+from countersteer.signals import Array
 from countersteer.tuning import shooting
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import QUANTITIES

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.car import Car, Wheels
-from countersteer.car.parameter import Array, Scalar
+from countersteer.car.car import Car
 from countersteer.runs.run import Run
+from countersteer.signals import Array, Command, Motion, Scalar, Wheels
 from countersteer.tuning import windows
 from countersteer.tuning.windows import (
     QUANTITIES,
@@ -27,10 +27,8 @@ from countersteer.tuning.windows import (
     read_measured,
     rolling,
 )
-from countersteer.world import motor, planar, servo
+from countersteer.world import plant
 from countersteer.world.chassis import Vector
-from countersteer.world.planar import Command
-from countersteer.world.state import Motion
 
 BEFORE = 0.6  # s before a window in which servo and controller settle from an old command
 SAMPLE = 0.05  # s between the instants at which motions are compared
@@ -118,37 +116,18 @@ def predict(car: Car, shot: Shots, dt: float) -> Array:
     samples = shot.measured.shape[-1]
     every = round(SAMPLE / dt)
     before = round(BEFORE / dt)
-    throttle = _late(shot.throttle, car.motor.delay / dt)
-    steering = _late(shot.steering, car.servo.delay / dt)
-    goals = Command(motor.duty(car.motor, throttle), servo.target(car.servo, steering))
-
-    def settle(at: tuple[Scalar, Scalar], goal: Command) -> tuple[tuple[Scalar, Scalar], None]:
-        angle, duty = at
-        return (
-            servo.turn(car.servo, angle, goal.steering, dt),
-            duty - (goal.throttle - duty) * jnp.expm1(-dt / car.motor.lag),
-        ), None
-
-    first = (goals.steering[0], goals.throttle[0])
-    (angle, duty), _ = jax.lax.scan(settle, first, jax.tree.map(lambda g: g[:before], goals))
+    commands = plant.as_it_arrives(car, Command(shot.throttle, shot.steering), dt)
+    angle, duty = plant.settled(car, jax.tree.map(lambda line: line[:before], commands), dt)
     motion = _start(car, shot, angle, duty)
-    no_walls = jnp.full((1, 4), jnp.nan)
-    state = planar.initial_state(car, dt, slots=1)._replace(motion=motion)
-    state = jax.tree.map(jnp.asarray, state)
-
-    def tick(state: planar.State, now: Command) -> tuple[planar.State, None]:
-        work = planar.Tick(car, no_walls, now, now, 0, dt)
-        return planar.move(state, work)[0], None
-
-    def sample(state: planar.State, now: Command) -> tuple[planar.State, tuple[Scalar, ...]]:
-        state, _ = jax.lax.scan(tick, state, now)
-        return state, quantities_of(car, state.motion)
-
-    pieces = jax.tree.map(
-        lambda line: line[before : before + samples * every].reshape(samples, every),
-        Command(throttle, steering),
+    ahead = jax.tree.map(lambda line: line[before : before + samples * every], commands)
+    _, seen = plant.rollout(
+        car,
+        plant.state_of(car, motion, dt),
+        ahead,
+        every,
+        dt,
+        lambda state: quantities_of(car, state.motion),
     )
-    _, seen = jax.lax.scan(sample, state, pieces)
     vx, vy, yaw_rate, rims = seen
     # An encoder counts over two samples; the one before the window is as the one at its start.
     line = jnp.concatenate([quantities_of(car, motion)[3][None], rims, rims[-1:]])
@@ -168,14 +147,3 @@ def _start(car: Car, shot: Shots, angle: Scalar, duty: Scalar) -> Motion:
     zero = 0.0 * shot.charge
     ax, ay = shot.acceleration
     return Motion(zero, zero, zero, *shot.velocity, wheels, angle, duty, ax, ay, shot.charge)
-
-
-def _late(line: Array, ticks: Scalar) -> Array:
-    """The line so many ticks later, by interpolation; it was what it is at its start before."""
-    at = jnp.arange(line.shape[0]) - ticks
-    whole = jnp.floor(at)
-    part = at - whole
-    index = whole.astype(jnp.int32)
-    last = line.shape[0] - 1
-    here, there = (line[jnp.clip(i, 0, last)] for i in (index, index + 1))
-    return here + part * (there - here)

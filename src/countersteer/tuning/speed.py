@@ -106,9 +106,9 @@ def from_sonar(run: Run) -> Speed:
 def from_lines(run: Run) -> Speed:
     """Speed over lines that are `line_spacing_m` of `run.toml` apart, from `line_crossings`.
 
-    Lines passed times their spacing, over the time between two rows in which the count rises. A row
-    comes up to a row's time after the line, so that a time T is off by the difference of two
-    uniform numbers, and the speed v by v/T times that.
+    Lines passed times their spacing, over the time between two rows in which the count rises. A
+    line was passed anywhere between its row and the row before, so that a time T is off by the
+    difference of two uniform numbers, and the speed v by v/T times that.
     """
     spacing = run.about.get("line_spacing_m")
     if not isinstance(spacing, float | int) or not 0 < spacing < math.inf:
@@ -125,11 +125,13 @@ def from_lines(run: Run) -> Speed:
     if len(time) < 2:
         raise InputError(f"{run.path}/telemetry.csv: line_crossings holds no two lines")
     assert run.telemetry is not None
-    row = float(np.median(np.diff(run.telemetry["time_s"])))
-    took = np.diff(time)
+    rows = run.telemetry["time_s"]
+    gap = time - rows[np.maximum(np.searchsorted(rows, time) - 1, 0)]
+    first, last = gap[:-1], gap[1:]
+    took = np.diff(time) + (first - last) / 2
     speed = spacing * np.diff(counts) / took
-    middle = time[1:] - (took + row) / 2
-    return Speed(middle, speed, speed / took * row * ROUNDED_TWICE, took)
+    middle = (time[1:] + time[:-1] - (first + last) / 2) / 2
+    return Speed(middle, speed, speed / took * np.sqrt((first**2 + last**2) / 12), took)
 
 
 READERS: dict[str, Callable[[Run], Speed]] = {

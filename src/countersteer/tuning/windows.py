@@ -15,14 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import savgol_filter
 
-from countersteer.car.car import Car, Wheels
-from countersteer.car.parameter import Scalar
+from countersteer.car.car import Car
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
+from countersteer.signals import Command, Motion, Scalar, Wheels
 from countersteer.world import motor, planar, servo
 from countersteer.world.chassis import Vector, dot
-from countersteer.world.planar import Command
-from countersteer.world.state import Motion, State
+from countersteer.world.state import State
 
 QUANTITIES = ("vx_mps", "vy_mps", "yaw_rate_radps", "wheel_speed_mps")
 CHANGES = {"vx_mps": 0.3, "vy_mps": 0.3, "yaw_rate_radps": 1.0}  # that make a window transient

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 
 # A quarter turn as a sum; thousands of quarters of the first two are exact even in 32 bits.
 QUARTER = (1.5703125, 0.0004837512969970703, 7.549789954891882e-08)

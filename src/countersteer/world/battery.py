@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from countersteer.car.car import Battery
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 
 
 def open_circuit(battery: Battery, charge: Scalar) -> Scalar:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from countersteer.car.car import GRAVITY, Body, Wheels
-from countersteer.car.parameter import Scalar
+from countersteer.car.car import GRAVITY, Body
+from countersteer.signals import Scalar, Wheels
 
 
 class Vector(NamedTuple):

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import jax
 
-from countersteer.car.car import Car, Wheels
-from countersteer.car.parameter import Scalar
+from countersteer.car.car import Car
+from countersteer.signals import Scalar, Wheels
 from countersteer.world.motor import Drive
 
 COUPLING = 1e-3  # N m s/rad of a differential locked by half

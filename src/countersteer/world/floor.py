@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.car import Body, Wheels, wheel_positions
-from countersteer.car.parameter import Scalar
+from countersteer.car.car import Body, wheel_positions
 from countersteer.errors import InputError
+from countersteer.signals import Motion, Scalar, Wheels
 from countersteer.world.angle import cosine, cosine_sine
-from countersteer.world.state import Motion
 
 KEYS = ("x_radpm", "y_radpm", "phase_rad")  # of a wave in files
 WAVES = 8

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from countersteer.car.car import Battery, Drivetrain, Motor
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 from countersteer.world import battery as pack
 
 NEUTRAL = 0.05  # duty over which the controller goes from its neutral brake to driving

@@ -23,6 +23,7 @@ chords, which always gets on: it gives up order, and contacts cannot put energy 
 Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -31,26 +32,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.car.car import Car, Wheels, wheel_positions
-from countersteer.car.parameter import Array, Scalar
+from countersteer.car.car import Car, wheel_positions
+from countersteer.car.parameter import pytree
+from countersteer.signals import Array, Command, Motion, Scalar, Wheels
 from countersteer.world import battery, chassis, drivetrain, motor, servo, tyre, walls
 from countersteer.world.angle import cosine_sine
 from countersteer.world.chassis import Symmetric, Vector, combine, dot, times
 from countersteer.world.floor import Floor, under_wheels
-from countersteer.world.state import Motion, State
+from countersteer.world.state import State
+from countersteer.world.world import Events
 
 ROLL_OVER_TIME = 0.1  # s that a pair of wheels is in the air until the car counts as rolled over
 FEW = 32  # slots of a delay line that are read one by one
 TANGENT = Wheels(1.0, 1.0, 1.0, 1.0)
 GAMMA = 1 - math.sqrt(0.5)  # of the two-stage method
 TOUCH_TIME = 0.2  # s without contact after which the next one is a new touch
-
-
-class Command(NamedTuple):
-    """What a driver asks for."""
-
-    throttle: Scalar  # -1 to 1; negative is reverse or brake
-    steering: Scalar  # angle of the front wheels, rad, positive to the left
 
 
 class Tick(NamedTuple):
@@ -486,3 +482,44 @@ def forces(car: Car, motion: Motion, floor: Floor | None = None) -> Wheels:
             )
         )
     )
+
+
+@pytree
+class Planar:
+    """The planar world as a `World`. `slots` is the length of its delay lines in ticks."""
+
+    car: Car
+    walls: Array  # (n, 4), padded with rows of NaN
+    floor: Floor | None = None
+    dt: float = dataclasses.field(metadata={"static": True})
+    slots: int = dataclasses.field(metadata={"static": True})
+
+    def init(
+        self,
+        pose: tuple[Scalar, Scalar, Scalar],
+        velocity: tuple[Scalar, Scalar, Scalar] = (0.0, 0.0, 0.0),
+        charge: Scalar = 1.0,
+    ) -> State:
+        """The car at x, y, heading with velocity vx, vy, yaw rate; no command is under way."""
+        return initial_state(self.car, self.dt, pose, velocity, charge, self.slots)
+
+    def step(self, state: State, command: Command, tick: Scalar) -> State:
+        """One tick."""
+        return step(self.car, self.walls, state, command, tick, self.dt, self.floor)
+
+    def motion(self, state: State) -> Motion:
+        """The car's."""
+        return state.motion
+
+    def events(self, state: State) -> Events:
+        """Touches of walls, and whether the car lies on its side."""
+        return Events(state.wall_contacts, state.rolled_over)
+
+    def forces(self, motion: Motion) -> Wheels:
+        """The four contacts' forces: `Forces` of each wheel."""
+        return forces(self.car, motion, self.floor)
+
+
+def planar(car: Car, walls: Array, floor: Floor | None, dt: float) -> Planar:
+    """The world of a car; its precision is that of the car's leaves."""
+    return Planar(car=car, walls=walls, floor=floor, dt=dt, slots=delay_slots(car, dt))

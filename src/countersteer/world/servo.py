@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from countersteer.car.car import Body, Servo
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 from countersteer.world.angle import cosine_sine
 
 

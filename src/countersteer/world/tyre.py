@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from countersteer.car.car import MagicFormula, Tire
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Scalar
 
 TINY = 1e-9  # keeps roots and their derivatives finite at no slip
 

@@ -1,19 +1,29 @@
 """Walls: the car's rectangle against line segments."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from countersteer.car.car import Body
-from countersteer.car.parameter import Scalar
+from countersteer.signals import Motion, Scalar
 from countersteer.world.angle import cosine_sine
-from countersteer.world.state import Motion
 
 FAR = 1e5  # m
+LEAST = 8  # rows
 FEW = 16  # walls that are compared one by one
 PREFERENCE = 1e-3  # depth that a wall gives up per distance by which it misses the corner
+
+
+def padded(walls: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Walls with rows of NaN up to a power of two, so that like courses share a program."""
+    rows = max(LEAST, 1 << math.ceil(math.log2(max(len(walls), 1))))
+    full = np.full((rows, 4), np.nan, dtype)
+    full[: len(walls)] = walls
+    return full
 
 
 class Overlap(NamedTuple):

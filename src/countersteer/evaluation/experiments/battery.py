@@ -15,8 +15,8 @@ from countersteer.drivers.replay import Replay
 from countersteer.evaluation.experiments.found import Found, Report, silent
 from countersteer.evaluation.open_drives import batch, commands, drives
 from countersteer.evaluation.rollout import LANES
-from countersteer.evaluation.turns import sideslip
 from countersteer.runs.run import Run, drawn_car
+from countersteer.task.turns import sideslip
 
 CHARGES, WEARS = (1.0, 0.75, 0.5, 0.25), (0.0, 0.5, 1.0)
 # Time (s), throttle, part of the full lock.

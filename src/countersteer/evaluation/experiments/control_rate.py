@@ -15,16 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Scalar, changed, pytree
+from countersteer.car.parameter import changed, pytree
 from countersteer.course.course import Course, from_segments
 from countersteer.drivers.drift_turn import STRAIGHT, DriftTurn, drift_turn
-from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.driver import Observation, Status
 from countersteer.evaluation.evaluate import interval
 from countersteer.evaluation.experiments.found import Found, Report, silent
 from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.rollout import LANES, REACHED, rollouts
+from countersteer.evaluation.rollout import LANES, rollouts
 from countersteer.link.link import LINKS
+from countersteer.pilot import Pilot
+from countersteer.signals import Command, Scalar
 from countersteer.simulator import Simulator
+from countersteer.task.task import Outcome
 
 TRIALS = 256
 SPEED = 2.0  # m/s
@@ -54,11 +57,16 @@ class OpenLoop:
         """Before the turn."""
         return Memory(self.inner.reset(key), 0, math.inf)
 
+    def status(self, memory: Memory) -> Status:
+        """That of the driver within."""
+        return self.inner.status(memory.inner)
+
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """The recorded command in the turn, else the inner driver's."""
         now = observation.time
         command, inner = self.inner.act(memory.inner, observation)
-        begun = jnp.where(inner.turn > memory.turn, now, memory.begun)
+        turn = self.inner.status(inner).turn
+        begun = jnp.where(turn > memory.turn, now, memory.begun)
         index = jnp.floor((now - begun) / STEP + 1e-3)
         count = self.throttle.shape[-1]
         playing = (index >= 0) & (index < count)
@@ -71,7 +79,7 @@ class OpenLoop:
             jnp.where(playing, throttle, command.throttle),
             jnp.where(playing, steering, command.steering),
         )
-        return command, Memory(inner, inner.turn, begun)
+        return command, Memory(inner, turn, begun)
 
 
 def corner(width: float = 1.4, name: str = "corner") -> Course:
@@ -82,9 +90,9 @@ def corner(width: float = 1.4, name: str = "corner") -> Course:
 
 def record(course: Course, car: Car, driver: DriftTurn) -> tuple[np.ndarray, np.ndarray]:
     """Throttle and steering of the turn with the nominal car and the first battery."""
-    simulator = Simulator(course, jax.tree.map(np.float32, car), driver, seed=0)
-    drive = simulator.record(LONGEST)
-    turning = np.nonzero(drive.turn > 0)[0]
+    simulator = Simulator.of(course, jax.tree.map(np.float32, car))
+    drive = simulator.record(Pilot.of(driver, course, car), LONGEST)
+    turning = np.nonzero(drive.status.turn > 0)[0]
     calm = (np.abs(drive.motion.yaw_rate) < math.radians(30)) & (
         np.abs(np.arctan2(drive.motion.vy, drive.motion.vx)) < math.radians(10)
     )
@@ -122,11 +130,19 @@ def simulate(
         )
         cars = changed(drawn.cars, "battery.wear", np.full(trials, wear, np.float32))
         driver: Any = closed if loop == "closed" else open_loop
-        simulator = Simulator(course, jax.tree.map(np.float32, car), driver, LINKS[link])
+        pilot = Pilot.of(driver, course, car, link=LINKS[link])
         score = rollouts(
-            simulator, drawn._replace(cars=cars), [driver] * trials, seeds, 1, LONGEST, lanes=lanes
+            course,
+            pilot,
+            drawn._replace(cars=cars),
+            [driver] * trials,
+            seeds,
+            1,
+            LONGEST,
+            lanes=lanes,
+            link=LINKS[link],
         )
-        won = score.status == REACHED
+        won = score.outcome == Outcome.REACHED.code
         ended = np.isfinite(score.turns.end[:, 0])
         error = np.degrees(score.turns.error[ended, 0])
         errors[link, loop, battery] = error

@@ -18,8 +18,8 @@ from countersteer.evaluation.experiments.found import Found, Report, silent
 from countersteer.evaluation.open_drives import batch, commands, drives
 from countersteer.evaluation.open_turns import OFF, series_of
 from countersteer.evaluation.rollout import LANES
-from countersteer.evaluation.turns import sideslip
 from countersteer.runs.run import Run, drawn_car
+from countersteer.task.turns import sideslip
 
 SPEEDS = np.linspace(0.4, 4.0, 37)  # m/s
 LOCKS = (0.4, 0.6, 0.8, 1.0)  # parts of the full one

@@ -17,9 +17,10 @@ from countersteer.errors import InputError
 from countersteer.evaluation.experiments.control_rate import LONGEST, SPEED, corner
 from countersteer.evaluation.experiments.found import Found, Report, silent
 from countersteer.evaluation.open_turns import Series, series_of, stops
-from countersteer.evaluation.turns import sideslip
+from countersteer.pilot import Pilot
 from countersteer.runs.run import Run
 from countersteer.simulator import Simulator
+from countersteer.task.turns import sideslip
 
 BEFORE, BEHIND = 1.0, 0.8  # s about the kill that are shown
 
@@ -27,10 +28,8 @@ BEFORE, BEHIND = 1.0, 0.8  # s about the kill that are shown
 def simulate(car: Car, name: str, report: Report = silent) -> Found:
     """The nominal car with a full battery, at 2 m/s."""
     course = corner()
-    simulator = Simulator(
-        course, jax.tree.map(np.float32, car), drift_turn(course, car, SPEED), seed=0
-    )
-    drive = simulator.record(LONGEST)
+    simulator = Simulator.of(course, jax.tree.map(np.float32, car))
+    drive = simulator.record(Pilot.of(drift_turn(course, car, SPEED), course, car), LONGEST)
     report(1, 1)
     m, every = drive.motion, slice(0, None, 5)
     series = Series(

@@ -10,7 +10,6 @@ import dataclasses
 import math
 from typing import Any
 
-import jax
 import numpy as np
 
 from countersteer.car.car import Car
@@ -19,7 +18,7 @@ from countersteer.drivers.drift_turn import drift_turn
 from countersteer.evaluation.experiments.found import Found, Report, silent
 from countersteer.evaluation.population import draw, load_population
 from countersteer.evaluation.rollout import rollouts
-from countersteer.simulator import Simulator
+from countersteer.pilot import Pilot
 
 TRIALS = 1000
 TURNS = 4
@@ -40,13 +39,12 @@ def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS)
     """Over random cars; the heading's error is that at the end of the last turn."""
     course, seeds = open_floor(), range(trials)
     drawn = draw(load_population("around"), car, course, seeds, np.float32)
-    small = jax.tree.map(np.float32, car)
     errors = {}
     for i, (label, carry) in enumerate((("carried over", 1.0), ("each by itself", 0.0))):
         driver = dataclasses.replace(drift_turn(course, car, SPEED), linked=1.0, carry=carry)
-        simulator = Simulator(course, small, driver)
         score = rollouts(
-            simulator,
+            course,
+            Pilot.of(driver, course, car),
             drawn,
             [driver] * trials,
             seeds,

@@ -20,9 +20,9 @@ import numpy as np
 from scipy.stats import qmc
 
 from countersteer.car.car import Car
-from countersteer.car.parameter import Scalar, pytree
+from countersteer.car.parameter import pytree
 from countersteer.course.course import from_segments
-from countersteer.drivers.driver import Command, Observation
+from countersteer.drivers.driver import Observation
 from countersteer.drivers.policy import library
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.straighten import holding_throttle
@@ -31,6 +31,7 @@ from countersteer.evaluation.evaluate import DRIFT
 from countersteer.evaluation.experiments.found import Found, Report, silent
 from countersteer.evaluation.open_drives import batch, drives
 from countersteer.evaluation.rollout import LANES
+from countersteer.signals import Command, Scalar
 
 DRAWS = 512
 GATE = 1.2  # m before and behind the corner

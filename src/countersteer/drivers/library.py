@@ -1,0 +1,71 @@
+"""Drivers by the names that the command line has for them, and as `run.toml` keeps them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from countersteer.car.car import Car
+from countersteer.car.files import read_toml
+from countersteer.course.course import Course
+from countersteer.drivers import plan, policy
+from countersteer.drivers.drift_turn import drift_turn
+from countersteer.drivers.driver import Driver
+from countersteer.drivers.plan import Read
+from countersteer.drivers.replay import Replay
+from countersteer.drivers.straighten import straighten
+from countersteer.errors import InputError
+
+DRIVERS = ("drift-turn", "straighten")
+
+
+def make_driver(
+    name: str,
+    course: Course,
+    car: Car,
+    speed: float | None,
+    laps: int,
+    read: Read,
+) -> tuple[Driver, dict[str, Any]]:
+    """A driver for a course and a nominal car, and the tables by which `driver_of_tables` makes it.
+
+    `name` is one of the library, a policy or plan `.toml`, or a `commands.csv`, which `read` reads.
+    `speed` (m/s) is what it is asked to bring to a turn. Raises `InputError`.
+    """
+    if name.endswith(".csv"):
+        if speed is not None:
+            raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
+        return replay(read(Path(name))), {"kind": "replay"}
+    tables: dict[str, Any] = {} if speed is None else {"speed_mps": speed}
+    if name == "straighten":
+        tables = {"kind": name, **tables}
+    elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
+        numbers, where = read_toml(name, plan.LIBRARY, "driver")
+        tables = {"kind": str(numbers.get("kind")), "file": where, **tables, "numbers": numbers}
+    else:
+        known = ", ".join([*DRIVERS, *plan.library()])
+        raise InputError(f"no driver {name}: give one of {known}, a .toml or a commands.csv")
+    return driver_of_tables(tables, course, car, laps, read), tables
+
+
+def driver_of_tables(
+    tables: Mapping[str, Any], course: Course, car: Car, laps: int, read: Read
+) -> Driver:
+    """The driver of a `[driver]` table. Raises `InputError` where it is of a kind unknown here."""
+    kind, speed = tables.get("kind"), tables.get("speed_mps")
+    where, numbers = str(tables.get("file", "run.toml")), tables.get("numbers", {})
+    if kind == "plan":
+        return plan.plan(numbers, where, course, car, read, speed, laps)
+    if kind == "straighten":
+        return straighten(course, car, speed)
+    if numbers:
+        return drift_turn(course, car, speed, laps, *policy.policy_of_tables(numbers, where))
+    raise InputError(f"{where}: no driver of kind {kind!r} can be made from plain data")
+
+
+def replay(commands: Mapping[str, np.ndarray]) -> Replay:
+    """Plays `time_s`, `throttle` and `steering` (rad)."""
+    return Replay(
+        times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
+    )

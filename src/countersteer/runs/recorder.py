@@ -1,0 +1,165 @@
+"""Writes a run's folder while the drive goes on: simulated, imported or real."""
+
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import tomli_w
+
+from countersteer.errors import InputError
+from countersteer.runs.files import COMMANDS, TableWriter, column_rows, command_rows
+from countersteer.runs.mcap import McapWriter
+from countersteer.signals import TRUTH, Command, Readings, flat, pairs
+
+
+class Pace(NamedTuple):
+    """How often what is recorded, in ticks of `dt` seconds."""
+
+    dt: float
+    telemetry: int
+    truth: int
+    onboard: bool  # then each reading has a row of its own tick
+
+
+class Frames(NamedTuple):
+    """What passed between pilot and car at some instants: arrays with an axis of instants in front.
+
+    A real car's recorder feeds one at a time, a simulation half a second.
+    """
+
+    tick: np.ndarray
+    readings: Readings  # the sensors' last reports then
+    command: Command  # that the car runs from then on
+    fresh: np.ndarray  # whether it is a new one
+    truth: tuple[np.ndarray, ...] | None = None  # values of `TRUTH`; None where nothing tells
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """An empty folder for a run. Without `out`, a numbered one under `runs/`.
+
+    A run that is there already is kept: it is moved aside to a name with the next free number.
+    Raises `InputError` where the folder holds something that is no run.
+    """
+    if out is None:
+        return _numbered(Path("runs"), name)
+    try:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            if not (out / "run.toml").exists():
+                raise InputError(f"{out}: is there already and is not a run: give another --out")
+            others = (out.with_name(f"{out.name}.{number}") for number in itertools.count(1))
+            out.rename(next(path for path in others if not path.exists()))
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made: {error.strerror}") from None
+    return out
+
+
+def _numbered(parent: Path, name: str) -> Path:
+    """A folder of the first free number; two drives at once get two."""
+    number = 1
+    while True:
+        folder = parent / f"{name}-{number:03d}"
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+class Recorder:
+    """A folder with `run.toml`, tables that grow, and `run.mcap`; flushed with every piece.
+
+    It takes frames (`record`), or whole tables as an importer has them (`write`).
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        about: dict[str, Any],
+        headers: Mapping[str, Sequence[str]] | None = None,
+        channels: Readings | None = None,
+        pace: Pace | None = None,
+    ) -> None:
+        """Writes `run.toml` and the headers of the tables, by their names.
+
+        Frames need the `channels` of the car's sensors and the `pace`, and bring their headers.
+        """
+        self.folder = folder
+        self._channels, self._pace = channels, pace
+        self._told = -1  # tick of the last row of telemetry
+        if channels is not None:
+            told = [column for channel in flat(channels) for column in channel.columns]
+            truth = ("time_s", *(channel.name for channel in TRUTH))
+            headers = {"commands": COMMANDS, "telemetry": ("time_s", *told), "truth": truth}
+        assert headers is not None
+        text = tomli_w.dumps(about)
+        (folder / "run.toml").write_text(text)
+        self._tables = {
+            name: TableWriter(folder / f"{name}.csv", header) for name, header in headers.items()
+        }
+        self._mcap = McapWriter(folder / "run.mcap", about, text, headers)
+        self._summary: dict[str, Any] | None = None
+
+    def record(self, frames: Frames) -> None:
+        """Appends frames: rows of all three tables."""
+        assert self._channels is not None, "frames need channels"
+        assert self._pace is not None, "frames need a pace"
+        pace, tick = self._pace, np.asarray(frames.tick)
+        time, told = tick * pace.dt, [*pairs(self._channels, frames.readings)]
+        rows = tick % pace.telemetry == 0
+        if pace.onboard:
+            for _, reading in told:
+                rows |= (np.asarray(reading.tick) == tick) & (tick > 0)
+        rows = np.nonzero(rows)[0]
+        before = np.concatenate([[self._told], tick[rows]])
+        telemetry = [time[rows]]
+        for _, reading in told:
+            new = np.asarray(reading.tick)[rows] > np.maximum(before[:-1], 0)
+            values = np.asarray(reading.value)[rows].reshape(len(rows), -1)  # a column each
+            telemetry.extend(np.where(new[:, None], values, np.nan).T)
+        self._told = int(before[-1])
+        fresh, command = np.nonzero(frames.fresh)[0], frames.command
+        tables = {
+            "commands": tuple(np.asarray(c)[fresh] for c in (time, *command)),
+            "telemetry": telemetry,
+        }
+        shown = np.nonzero(tick % pace.truth == 0)[0]
+        if frames.truth is not None:
+            tables["truth"] = [np.asarray(column)[shown] for column in (time, *frames.truth)]
+        self.write(tables)
+
+    def write(self, tables: Mapping[str, Sequence[np.ndarray]]) -> None:
+        """Appends a piece: columns by table, in the order of its header.
+
+        `commands` is time, throttle (negative in reverse) and steering (rad); NaN is an empty cell.
+        """
+        cells: dict[str, list[list[str]]] = {name: [] for name in self._tables}
+        for name, columns in tables.items():
+            cells[name] = command_rows(*columns) if name == "commands" else column_rows(columns)
+        for name, table in self._tables.items():
+            table.write(cells[name])
+        self._mcap.write(cells)
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Writes `summary.json`."""
+        self._summary = summary
+        (self.folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for table in self._tables.values():
+            table.close()
+        self._mcap.close(self._summary)

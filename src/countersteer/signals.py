@@ -1,0 +1,137 @@
+"""The signals of the seam between what drives and what is driven: readings in, command out.
+
+A `Channel` declares a quantity once: its name at every edge, its unit, its range and its shape.
+Headers of tables, messages of MCAP files, ranges of failing sensors and help derive from it.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+# A number: Python's, NumPy's or one that JAX traces; with axes in front, a batch. These have
+# no type in common that arithmetic keeps, so the checker is told nothing.
+Scalar: TypeAlias = Any
+Array: TypeAlias = Any  # the same with one axis or more
+
+
+class Wheels(NamedTuple):
+    """One value for each wheel, in the order that the whole project uses."""
+
+    front_left: Scalar
+    front_right: Scalar
+    rear_left: Scalar
+    rear_right: Scalar
+
+
+class Command(NamedTuple):
+    """What a driver asks for."""
+
+    throttle: Scalar  # -1 to 1; negative is reverse or brake
+    steering: Scalar  # angle of the front wheels, rad, positive to the left
+
+
+class Motion(NamedTuple):
+    """All of a car that changes smoothly. SI units, radians, ISO 8855 axes."""
+
+    x: Scalar  # centre of mass, m
+    y: Scalar
+    heading: Scalar  # unwrapped
+    vx: Scalar  # velocity of the centre of mass along the body's axes, m/s
+    vy: Scalar
+    yaw_rate: Scalar
+    wheels: Wheels  # spin of each wheel, rad/s, positive forward
+    steering: Scalar  # angle that a wheel between the front wheels would have
+    duty: Scalar  # of the speed controller, -1 to 1, behind the throttle
+    load_ax: Scalar  # accelerations that the wheel loads have followed so far, m/s²
+    load_ay: Scalar
+    charge: Scalar  # of the battery, 0 to 1
+
+
+class Reading(NamedTuple):
+    """A sensor's last report; `tick` is -1 until there was one."""
+
+    value: Scalar
+    tick: Scalar
+
+
+class Readings(NamedTuple):
+    """The last report of every sensor. SI units, radians."""
+
+    sonar: tuple[Reading, ...]  # m, in the order of the car's mounts; inf: no echo
+    counts: Reading  # regions of the encoder passed since the start
+    wheel_speed: Reading  # m/s, never negative
+    gyroscope: Reading  # rad/s
+    accel_x: Reading  # m/s²
+    accel_y: Reading
+    battery: Reading  # V
+    line_crossings: Reading | None = None  # lines entered since the start; None: no line detector
+    line_speed: Reading | None = None  # m/s, their spacing over the time since the last one
+    lidar: Reading | None = None  # (beams,), m, from right to left; inf: no echo; None: no lidar
+    position_x: Reading | None = None  # m; None: no such sensor
+    position_y: Reading | None = None
+    position_heading: Reading | None = None  # rad; None: the sensor tells no heading
+    truth: Motion | None = None  # ground truth, which no car has: for the estimator `truth` alone
+
+
+class Channel(NamedTuple):
+    """A quantity that a sensor reports, a state holds or a command asks for."""
+
+    name: str  # at every edge, with its unit
+    unit: str  # inside
+    low: Scalar  # the range of its values, in that unit; infinite where nothing bounds it
+    high: Scalar
+    meaning: str
+    sensor: str = ""  # the part that reports it; empty: none does
+    shape: tuple[int, ...] = ()
+    whole: bool = False  # whether it counts something
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of its numbers: one of a scalar, else numbered before the unit."""
+        if not self.shape:
+            return (self.name,)
+        stem, _, unit = self.name.rpartition("_")
+        digits = max(2, len(str(self.shape[0] - 1)))
+        return tuple(f"{stem}_{i:0{digits}}_{unit}" for i in range(self.shape[0]))
+
+
+INF = float("inf")
+TIME = Channel("time_s", "s", 0.0, INF, "time since the start")
+# Ground truth as `truth.csv` holds it: the simulated state, or motion capture of a real car.
+TRUTH = (
+    Channel("x_m", "m", -INF, INF, "centre of mass, east"),
+    Channel("y_m", "m", -INF, INF, "centre of mass, north"),
+    Channel("heading_rad", "rad", -INF, INF, "heading, unwrapped, positive to the left"),
+    Channel("vx_mps", "m/s", -INF, INF, "velocity of the centre of mass, forward"),
+    Channel("vy_mps", "m/s", -INF, INF, "velocity of the centre of mass, to the left"),
+    Channel("yaw_rate_radps", "rad/s", -INF, INF, "yaw rate, positive to the left"),
+    Channel("wheel_fl_radps", "rad/s", -INF, INF, "spin of the front left wheel"),
+    Channel("wheel_fr_radps", "rad/s", -INF, INF, "spin of the front right wheel"),
+    Channel("wheel_rl_radps", "rad/s", -INF, INF, "spin of the rear left wheel"),
+    Channel("wheel_rr_radps", "rad/s", -INF, INF, "spin of the rear right wheel"),
+    Channel("steering_rad", "rad", -INF, INF, "angle of a wheel between the front wheels"),
+    Channel("battery_v", "V", 0.0, INF, "voltage of the battery under load"),
+)
+
+
+def truth_columns(motion: Motion, voltage: Array) -> tuple[Array, ...]:
+    """The values of `TRUTH` for a motion."""
+    return (*motion[:6], *motion.wheels, motion.steering, voltage)
+
+
+def pairs(channels: Readings, readings: Readings) -> Iterator[tuple[Channel, Reading]]:
+    """Each channel of a car's sensors with its reading, in the order of the tables."""
+    yield from zip(flat(channels), flat(readings), strict=True)
+
+
+def unflat(like: Readings, parts: Sequence[Any]) -> Readings:
+    """The inverse of `flat`, for the sensors that `like` has."""
+    rest = iter(parts)
+    sonar = tuple(next(rest) for _ in like.sonar)
+    others: list[Any] = [None if part is None else next(rest) for part in like[1:-1]]
+    return Readings(*(sonar, *others, like.truth))
+
+
+def flat(readings: Readings) -> Sequence[Any]:
+    """What there is of a car's sensors, in the order of the tables; without the ground truth."""
+    others = (part for part in readings[1:-1] if part is not None)
+    return (*readings.sonar, *others)

@@ -1,0 +1,43 @@
+"""Random streams by name: each draw of a drive has a key that no other draw has.
+
+root(seed) ─► key(root, stream) ─► key(root, stream, tick) ─► one draw, or a split for several
+"""
+
+from enum import IntEnum
+
+import jax
+
+from countersteer.signals import Scalar
+
+
+class Stream(IntEnum):
+    """Who draws. A number stays what it is: records repeat by it."""
+
+    GYROSCOPE = 1
+    ACCELEROMETER = 2
+    VOLTMETER = 3
+    SONAR = 4
+    LIDAR = 5
+    POSITION = 6
+    LINK = 7
+    FAULTS = 8
+    WATCH = 9
+    DRIVER = 10
+    ESTIMATOR = 11
+
+
+def root(seed: Scalar) -> jax.Array:
+    """The key of a drive."""
+    return jax.random.key(seed)
+
+
+def key(root: jax.Array, stream: Stream, tick: Scalar = None) -> jax.Array:
+    """The key of a stream, or of its draw at a tick."""
+    noise, driver = jax.random.split(root)
+    if stream == Stream.DRIVER:
+        return driver
+    if stream == Stream.ESTIMATOR:
+        return jax.random.fold_in(driver, 1)
+    if stream == Stream.WATCH:
+        return jax.random.fold_in(noise, 9)
+    return jax.random.fold_in(jax.random.fold_in(noise, tick), stream)

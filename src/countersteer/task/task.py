@@ -1,0 +1,192 @@
+"""`Task`: a course to be driven to its goal, and the judge of it.
+
+Written once, for one sample of one drive: a recorded drive is a `scan` over its samples, a batch
+is `vmap`. Whoever drives, and whatever records, is judged alike: by motion and course.
+"""
+
+import dataclasses
+from enum import Enum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.parameter import pytree
+from countersteer.course.along import Line, line_of
+from countersteer.course.course import Course
+from countersteer.signals import Array, Motion, Scalar
+from countersteer.task import turns as turning
+from countersteer.task.turns import LONGEST, ROUNDING, STRAIGHT_FOR, Turns, goes_straight
+
+PERIOD = 0.005  # s between two samples that are judged, as in truth.csv
+STALLED = 5.0  # s without a step ahead
+STEP = 0.05  # m that count as one
+
+
+class Outcome(Enum):
+    """How a drive stands, or has ended: messages for people. Arrays hold their `code`."""
+
+    DRIVING = "driving"
+    REACHED = "goal reached"
+    TOUCHED = "touched a wall"
+    ROLLED = "rolled over"
+    STALLED = "stalled"
+    LOST = "lost its state"
+    LATE = "out of time"
+    INTERRUPTED = "interrupted"
+    DONE = "done"  # there was no goal, and nothing went wrong
+
+    @property
+    def code(self) -> int:
+        """Its number."""
+        return list(Outcome).index(self)
+
+    @classmethod
+    def of(cls, code: Scalar) -> "Outcome":
+        """The outcome of a code."""
+        return list(Outcome)[int(code)]
+
+
+class Sample(NamedTuple):
+    """What the judge looks at."""
+
+    time: Scalar  # s
+    motion: Motion
+    wall_contacts: Scalar
+    rolled_over: Scalar
+    turn: Scalar  # turns that the driver has begun
+
+
+class Score(NamedTuple):
+    """A drive so far."""
+
+    outcome: Scalar  # the code of an `Outcome`
+    distance: Scalar  # along the centre line, m
+    furthest: Scalar
+    furthest_at: Scalar  # s
+    goal_time: Scalar  # s; inf until it is reached
+    stirred_at: Scalar  # last time at which the car was not going straight
+    wall_contacts: Scalar
+    time: Scalar  # of the last sample
+    turns: Turns
+
+
+@pytree
+class Task:
+    """To drive a course from start to goal, so many laps where it is closed.
+
+    A drive that has reached its goal goes on until the turn that it is in, if any, has ended.
+    Where `walls_end` it ends with the first touch of a wall. Without a goal it ends when it must.
+    """
+
+    line: Line | None  # the centre line; None: there is no goal
+    start: Scalar  # distance along it, m
+    goal: Scalar  # m
+    bearings: Array  # (turns,) heading of the corridor behind each turn, rad
+    walls_end: bool = dataclasses.field(default=False, metadata={"static": True})
+
+    @classmethod
+    def of(
+        cls, course: Course | None, laps: int = 1, walls_end: bool = False, dtype: Any = np.float64
+    ) -> "Task":
+        """For a course, in a precision."""
+        number = np.dtype(dtype).type
+        if course is None or course.goal_distance is None:
+            none = np.zeros(0, dtype)
+            return cls(line=None, start=number(0), goal=number(np.inf), bearings=none)
+        bearings = course.start[2] + np.cumsum([t.angle for t in course.turns_ahead(laps)])
+        return cls(
+            line=line_of(course, dtype),
+            start=number(course.start_distance),
+            goal=number(course.lap_end(laps)),
+            bearings=np.asarray(bearings, dtype),
+            walls_end=walls_end,
+        )
+
+    def init(self) -> Score:
+        """Before the first sample."""
+        dtype = self.bearings.dtype
+        zero, inf = dtype.type(0), dtype.type(np.inf)
+        none = turning.before_any(len(self.bearings), dtype)
+        start = self.start
+        outcome = np.int32(Outcome.DRIVING.code)
+        return Score(outcome, start, start, zero, inf, zero, zero, zero, none)
+
+    def update(self, score: Score, sample: Sample) -> Score:
+        """The score with one sample more; a drive that is over stays as it is."""
+        time, motion = sample.time, sample.motion
+        distance = score.distance
+        if self.line is not None:
+            distance = self.line.follow(motion.x, motion.y, distance).distance
+        ahead = distance > score.furthest + STEP
+        reached = jnp.isinf(score.goal_time) & (distance >= self.goal - 1e-9)
+        goal_time = jnp.where(reached, time, score.goal_time)
+        stirred_at = jnp.where(goes_straight(motion), score.stirred_at, time)
+        furthest_at = jnp.where(ahead, time, score.furthest_at)
+        turns = turning.follow(score.turns, self.bearings, motion, sample.turn, time)
+        over = ~jnp.isinf(goal_time) & (
+            (time - stirred_at >= STRAIGHT_FOR - ROUNDING) | (time - goal_time >= LONGEST)
+        )
+        stalled = jnp.isinf(goal_time) & (time - furthest_at > STALLED)
+        outcome = jnp.int32(Outcome.DRIVING.code)
+        for found, name in (
+            (stalled & (self.line is not None), Outcome.STALLED.code),
+            (over, Outcome.REACHED.code),
+            (sample.rolled_over > 0, Outcome.ROLLED.code),
+            (self.walls_end & (sample.wall_contacts > 0), Outcome.TOUCHED.code),
+            (~jnp.isfinite(motion.x + motion.vx + motion.yaw_rate), Outcome.LOST.code),
+        ):
+            outcome = jnp.where(found, jnp.int32(name), outcome)
+        new = Score(
+            outcome,
+            distance,
+            jnp.where(ahead, distance, score.furthest),
+            furthest_at,
+            goal_time,
+            stirred_at,
+            sample.wall_contacts,
+            time,
+            turns,
+        )
+        ended = score.outcome != Outcome.DRIVING.code
+        return jax.tree.map(
+            lambda old, new: jnp.where(ended, old, jnp.asarray(new, jnp.result_type(old))),
+            score,
+            new,
+        )
+
+    def follow(self, score: Score, samples: Sample) -> tuple[Score, np.ndarray]:
+        """The score after a piece of a drive, and the outcome at each of its samples.
+
+        Leaves of `samples` have an axis of samples in front; they are taken in 64 bits.
+        """
+        with jax.enable_x64(True):
+            wide = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), samples)
+            score, outcomes = _follow(self, score, wide)
+            return jax.tree.map(np.asarray, score), np.asarray(outcomes)
+
+
+@jax.jit
+def _follow(task: Task, score: Score, samples: Sample) -> tuple[Score, Array]:
+    def step(score: Score, sample: Sample) -> tuple[Score, Scalar]:
+        score = task.update(score, sample)
+        return score, score.outcome
+
+    return jax.lax.scan(step, score, samples)
+
+
+def summary(score: Score, outcome: Outcome) -> dict[str, Any]:
+    """The JSON of a drive that ended so."""
+    completed = outcome in (Outcome.REACHED, Outcome.DONE)
+    contacts = int(score.wall_contacts)
+    return {
+        "completed": completed,
+        "success": completed and contacts == 0,
+        "status": outcome.value,
+        "wall_contacts": contacts,
+        "lap_time_s": float(score.goal_time) if np.isfinite(score.goal_time) else None,
+        "turns": [
+            dataclasses.asdict(turn) for turn in turning.results(score.turns, float(score.time))
+        ],
+    }

@@ -1,0 +1,147 @@
+"""What report and picture of a run are made from, read off the run's own files."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.car.car import GRAVITY, Car, wheel_positions
+from countersteer.errors import InputError
+from countersteer.runs.run import Run, drawn_car
+from countersteer.signals import Array, Motion, Wheels
+from countersteer.task.turns import sideslip
+from countersteer.world import planar
+from countersteer.world.floor import Floor, floor_of_run
+
+PERIOD = 0.01  # s between two samples, at least
+WHEELS = ("fl", "fr", "rl", "rr")
+
+
+def view_of(run: Run) -> dict[str, Any]:
+    """Plain lists, units in the names. Raises `InputError` where the run has no poses."""
+    if run.truth is None or len(run.truth) == 0:
+        raise InputError(f"{run.path}: has no truth.csv to draw")
+    truth, about, car = run.truth, run.about, drawn_car(run.about)
+    time = truth["time_s"]
+    period = float(np.median(np.diff(time))) if len(time) > 1 else PERIOD
+    every = slice(None, None, max(1, round(PERIOD / max(period, 1e-6))))
+    command = np.maximum(np.searchsorted(run.commands["time_s"], time + 1e-9, "right") - 1, 0)
+    vx, vy, steering = truth["vx_mps"], truth["vy_mps"], truth["steering_rad"]
+    shown = {
+        "speed_mps": np.hypot(vx, vy),
+        "sideslip_deg": np.degrees(sideslip(vx, vy)),
+        "yaw_rate_degps": np.degrees(truth["yaw_rate_radps"]),
+        "steering_deg": np.degrees(steering),
+        "steering_command_deg": np.degrees(run.commands["steering"][command]),
+        "throttle": run.commands["throttle"][command],
+    } | {name: truth[name] for name in ("time_s", "x_m", "y_m", "heading_rad")}
+    place = about.get("course", {}).get("name", "open floor")
+    body, tires = car.body, planar.tires_by_wheel(car)
+    return {
+        "title": f"{place}, {about['driver']}, {about['car_name']}, seed {about['seed']}",
+        "summary": run.summary,
+        "walls_m": about.get("course", {}).get("walls_m", []),
+        "car": {
+            "length_m": float(body.length),
+            "width_m": float(body.width),
+            "center_x_m": float(body.center),
+            "wheels": [
+                {
+                    "x_m": float(x),
+                    "y_m": float(y),
+                    "radius_m": float(tire.radius),
+                    "width_m": float(tire.width),
+                }
+                for x, y, tire in zip(*wheel_positions(body), tires, strict=True)
+            ],
+        },
+        "sonar": echoes(run, car) if place != "open floor" else [],
+        "wheels": wheel_views(car, motions(run, car), floor_of_run(about), every),
+    } | {name: values[every].tolist() for name, values in shown.items()}
+
+
+def echoes(run: Run, car: Car) -> list[dict[str, Any]]:
+    """What each sonar reported, and when."""
+    sonar, found = car.sensors.sonar, []
+    for name, mount in zip(sonar.mount_names, sonar.mounts, strict=True):
+        table: Any = run.telemetry or {}
+        heard = table.get(f"sonar_{name}_m", np.zeros(0))
+        told = ~np.isnan(heard)
+        found.append(
+            {
+                "name": name,
+                "x_m": float(mount.x),
+                "y_m": float(mount.y),
+                "angle_deg": math.degrees(mount.angle),
+                "half_angle_deg": math.degrees(sonar.half_angle),
+                "time_s": table["time_s"][told].tolist() if len(heard) else [],
+                "distance_m": [d if math.isfinite(d) else None for d in heard[told].tolist()],
+            }
+        )
+    return found
+
+
+def motions(run: Run, car: Car) -> Motion:
+    """The motion at each row of `truth.csv`; the loads follow the acceleration that rows tell.
+
+    A hit on a wall is no acceleration that a tyre has brought about: what is beyond friction is
+    left out, as the planar world does.
+    """
+    table = run.truth
+    assert table is not None
+    time, vx, vy, rate = (table[n] for n in ("time_s", "vx_mps", "vy_mps", "yaw_rate_radps"))
+    reach = (
+        1.2
+        * GRAVITY
+        * max(float(car.tires.front.peak_friction), float(car.tires.rear.peak_friction))
+    )
+    h = np.maximum(np.diff(time), 1e-9)
+    loads = []
+    for change, turning in ((np.diff(vx), -rate * vy), (np.diff(vy), rate * vx)):
+        felt = change / h + (turning[1:] + turning[:-1]) / 2
+        felt = np.clip(np.nan_to_num(felt), -reach, reach)
+        load = [0.0]
+        for push, part in zip(felt, -np.expm1(-h / float(car.body.load_lag)), strict=True):
+            load.append(load[-1] + part * (push - load[-1]))
+        loads.append(np.array(load))
+    zero = np.zeros(len(time))
+    wheels = Wheels(*(table[f"wheel_{wheel}_radps"] for wheel in WHEELS))
+    places = (table[name] for name in ("x_m", "y_m", "heading_rad"))
+    steering = table["steering_rad"]
+    parts: Any = (*places, vx, vy, rate, wheels, steering, zero, *loads, zero + 1.0)
+    return Motion(*parts)
+
+
+def wheel_views(
+    car: Car, motion: Motion, floor: Floor | None, every: slice
+) -> list[dict[str, list[float]]]:
+    """The forces at each wheel, in its own axes."""
+    thin = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[every], motion)
+    count = len(thin.x)
+    # As many rows for runs of about a length, so that they share a program.
+    rows = np.minimum(np.arange(1 << math.ceil(math.log2(max(count, 1)))), count - 1)
+    with jax.enable_x64(False):
+        single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), (car, floor))
+        found = _forces(*single, jax.tree.map(lambda leaf: leaf[rows], thin))
+    names = {
+        "force_x_n": "force_x",
+        "force_y_n": "force_y",
+        "limit_n": "limit",
+        "slip_mps": "slip",
+        "angle_rad": "angle",
+    }
+    return [
+        {
+            name: np.asarray(getattr(forces, field))[:count].astype(float).tolist()
+            for name, field in names.items()
+        }
+        for forces in found
+    ]
+
+
+@jax.jit
+def _forces(car: Car, floor: Floor | None, motion: Motion) -> Array:
+    forces = jax.vmap(lambda one: planar.forces(car, one, floor))(motion)
+    return jax.tree.map(lambda leaf: leaf + jnp.zeros_like(motion.x), forces)

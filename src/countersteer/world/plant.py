@@ -1,0 +1,97 @@
+"""The plant: one open-loop rollout over the planar world, which fits and planners share.
+
+Commands in, motion out. There are no sensors, no link and no delay lines: a delay is undone before,
+by taking the commands later (`delayed`), so that it has a derivative like all else.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from countersteer.car.car import Car
+from countersteer.signals import Array, Command, Motion, Scalar
+from countersteer.world import motor, planar, servo
+from countersteer.world.floor import Floor
+from countersteer.world.planar import State
+
+Seen = TypeVar("Seen")
+
+
+def delayed(line: Array, ticks: Scalar) -> Array:
+    """The line so many ticks later, by interpolation; it was what it is at its start before."""
+    at = jnp.arange(line.shape[0]) - ticks
+    whole = jnp.floor(at)
+    part = at - whole
+    index = whole.astype(jnp.int32)
+    last = line.shape[0] - 1
+    here, there = (line[jnp.clip(i, 0, last)] for i in (index, index + 1))
+    return here + part * (there - here)
+
+
+def as_it_arrives(car: Car, asked: Command, dt: float) -> Command:
+    """Commands (ticks,) as they reach motor and servo, after the car's pure delays."""
+    return Command(
+        delayed(asked.throttle, car.motor.delay / dt),
+        delayed(asked.steering, car.servo.delay / dt),
+    )
+
+
+def settled(car: Car, commands: Command, dt: float) -> tuple[Scalar, Scalar]:
+    """Where servo (rad) and speed controller (duty) stand after commands (ticks,).
+
+    They begin where the first command would have them.
+    """
+    goals = Command(
+        motor.duty(car.motor, commands.throttle), servo.target(car.servo, commands.steering)
+    )
+
+    def settle(at: tuple[Scalar, Scalar], goal: Command) -> tuple[tuple[Scalar, Scalar], None]:
+        angle, duty = at
+        return (
+            servo.turn(car.servo, angle, goal.steering, dt),
+            duty - (goal.throttle - duty) * jnp.expm1(-dt / car.motor.lag),
+        ), None
+
+    first = (goals.steering[0], goals.throttle[0])
+    at, _ = jax.lax.scan(settle, first, goals)
+    return at
+
+
+def state_of(car: Car, motion: Motion, dt: float) -> State:
+    """A state of the world with this motion, and no command under way."""
+    state = planar.initial_state(car, dt, slots=1)._replace(motion=motion)
+    return jax.tree.map(jnp.asarray, state)
+
+
+def rollout(
+    car: Car,
+    state: State,
+    commands: Command,
+    every: int,
+    dt: float,
+    look: Callable[[State], Seen],
+    walls: Array | None = None,
+    floor: Floor | None = None,
+) -> tuple[State, Seen]:
+    """The state after commands (ticks,), and what `look` sees of it after each `every` ticks.
+
+    Commands are taken as they reach motor and servo. The ticks are a multiple of `every`. Without
+    `walls` (n, 4) it is open floor, and nothing is computed for them.
+    """
+    nowhere = jnp.full((1, 4), jnp.nan)
+    stages = (planar.move,) if walls is None else (planar.move, planar.collide, planar.judge)
+
+    def tick(state: State, now: Command) -> tuple[State, None]:
+        work = planar.Tick(car, nowhere if walls is None else walls, now, now, 0, dt, floor)
+        for stage in stages:
+            state, work = stage(state, work)
+        return state, None
+
+    def sample(state: State, now: Command) -> tuple[State, Seen]:
+        state, _ = jax.lax.scan(tick, state, now)
+        return state, look(state)
+
+    pieces = jax.tree.map(lambda line: line.reshape(-1, every), commands)
+    return jax.lax.scan(sample, state, pieces)
