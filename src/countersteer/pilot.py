@@ -8,6 +8,7 @@ It knows the nominal car and the course, and never the world: a batch runs it, a
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -16,14 +17,18 @@ import numpy as np
 
 from countersteer import streams
 from countersteer.car.car import Car
+from countersteer.car.files import car_from_tables
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
+from countersteer.course.files import course_of_run
 from countersteer.drivers.driver import Driver, Heard, Observation, Status, status_of
+from countersteer.drivers.library import driver_of_tables
+from countersteer.drivers.plan import Read
 from countersteer.errors import InputError
 from countersteer.estimation.estimator import Estimator
 from countersteer.estimation.library import ESTIMATORS
-from countersteer.link.link import ONBOARD, Link
-from countersteer.signals import Command, Reading, Readings, Scalar
+from countersteer.link.link import LINKS, ONBOARD, Link
+from countersteer.signals import Array, Command, Reading, Readings, Scalar
 from countersteer.streams import Stream
 
 PYTHON_PERIOD = 0.005  # s between two decisions of a driver in plain Python, unless it has its own
@@ -94,31 +99,52 @@ class Pilot:
         estimator: Estimator = jax.tree.map(np.dtype(dtype).type, self.estimator)
         return dataclasses.replace(self, estimator=estimator)
 
+    @property
+    def dtype(self) -> Any:
+        """The precision that it estimates in."""
+        return np.dtype(getattr(jax.tree.leaves(self.estimator)[0], "dtype", np.float64))
+
+    def rerun(self, seed: int, readings: Readings, ticks: Array) -> Command:
+        """What it asks for at the ticks (n,) of its decisions: it needs no car for that.
+
+        Leaves of `readings` have an axis of n in front; `seed` is the drive's. JAX must be able to
+        trace it.
+        """
+        dtype = self.dtype
+        with jax.enable_x64(dtype == np.float64):
+            told = jax.tree.map(
+                lambda leaf: leaf if leaf.dtype.kind == "i" else leaf.astype(dtype), readings
+            )
+            return jax.tree.map(np.asarray, _rerun(self, streams.root(seed), told, ticks))
+
     def init(self, root: jax.Array) -> Memory:
         """Before the first decision; `root` is the drive's key (`streams.root`)."""
-        estimate = self.estimator.init(streams.key(root, Stream.ESTIMATOR))
-        memory = self.driver.reset(streams.key(root, Stream.DRIVER))
-        dtype = jnp.result_type(self.estimator.estimate(estimate).x)
-        if self.traced:
-            memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
-        zero = dtype.type(0)
-        return Memory(estimate, memory, Command(zero, zero))
+        with jax.enable_x64(self.dtype == np.float64):
+            estimate = self.estimator.init(streams.key(root, Stream.ESTIMATOR))
+            memory = self.driver.reset(streams.key(root, Stream.DRIVER))
+            dtype = jnp.result_type(self.estimator.estimate(estimate).x)
+            if self.traced:
+                memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
+            zero = dtype.type(0)
+            return Memory(estimate, memory, Command(zero, zero))
 
     def act(self, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Command, Memory]:
         """The command from this tick on, and the memory after it.
 
-        Raises `InputError` where a driver in Python returns something else than it should.
+        Called from Python it is compiled. Raises `InputError` where a driver in Python returns
+        something else than it should.
         """
-        if not self.traced:
-            return self._called(memory, readings, tick)
-        estimate, observation = self.observe(memory, readings, tick)
-        command, own = self.driver.act(memory.driver, observation)
-        after = Memory(
-            estimate,
-            jax.tree.map(_like, own, memory.driver),
-            jax.tree.map(_like, command, memory.command),
-        )
-        return after.command, after
+        if isinstance(tick, jax.core.Tracer):
+            return _act(self, memory, readings, tick)
+        with jax.enable_x64(self.dtype == np.float64):
+            if self.traced:
+                return _compiled_act(self, memory, readings, jnp.asarray(tick))
+            silent, bare = dataclasses.replace(self, driver=None), memory._replace(driver=())
+            estimate, observation = _compiled_observe(silent, bare, readings, jnp.asarray(tick))
+            answer = self.driver.act(memory.driver, jax.tree.map(np.asarray, observation))
+            command, own = checked(self.driver, answer)
+            command = Command(*map(self.dtype.type, command))
+            return command, Memory(estimate, own, command)
 
     def observe(self, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Any, Observation]:
         """The estimator's memory at this tick, and what the driver is told."""
@@ -148,18 +174,43 @@ class Pilot:
         """What the driver says it is about."""
         return status_of(self.driver, memory.driver)
 
-    def _called(self, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Command, Memory]:
-        """`act` with a driver in Python."""
-        silent = dataclasses.replace(self, driver=None)
-        bare = memory._replace(driver=())
-        estimate, observation = _observe(silent, bare, readings, jnp.asarray(tick))
-        answer = self.driver.act(memory.driver, jax.tree.map(np.asarray, observation))
-        command, own = checked(self.driver, answer)
-        after = Memory(estimate, own, jax.tree.map(_like, command, memory.command))
-        return after.command, after
+
+def _act(pilot: Pilot, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Command, Memory]:
+    estimate, observation = pilot.observe(memory, readings, tick)
+    command, own = pilot.driver.act(memory.driver, observation)
+    after = Memory(
+        estimate,
+        jax.tree.map(_like, own, memory.driver),
+        jax.tree.map(_like, command, memory.command),
+    )
+    return after.command, after
 
 
-_observe = jax.jit(Pilot.observe)
+_compiled_act, _compiled_observe = jax.jit(_act), jax.jit(Pilot.observe)
+
+
+@jax.jit
+def _rerun(pilot: Pilot, root: jax.Array, readings: Readings, ticks: Array) -> Command:
+    def decide(memory: Memory, now: tuple[Readings, Scalar]) -> tuple[Memory, Command]:
+        command, memory = pilot.act(memory, *now)
+        return memory, command
+
+    return jax.lax.scan(decide, pilot.init(root), (readings, ticks))[1]
+
+
+def pilot_of_run(about: Mapping[str, Any], read: Read) -> Pilot:
+    """The pilot of a `run.toml`. `read` reads a `commands.csv`, where a plan names one.
+
+    Raises `InputError` where the driver was no plain data, such as one in Python.
+    """
+    course = course_of_run(dict(about))
+    if not isinstance(about.get("nominal"), dict) or course is None:
+        raise InputError("run.toml: tells no [nominal] car or no [course]: it holds no pilot")
+    nominal = car_from_tables(about["nominal"], "run.toml: nominal")
+    driver = driver_of_tables(about["pilot"], course, nominal, int(about["laps"]), read)
+    link, dt = LINKS[about["link"]["name"]], float(about["rates"]["dt_s"])
+    pilot = Pilot.of(driver, course, nominal, str(about["estimate"]), link, dt)
+    return pilot.typed(np.float32) if about["precision_bits"] == 32 else pilot
 
 
 def traceable(driver: Any) -> bool:

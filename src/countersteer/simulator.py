@@ -266,12 +266,22 @@ def advance(
 @partial(jax.jit, static_argnums=1)
 def _apply(simulator: Simulator, ticks: int, loop: Loop, command: Command) -> tuple[Loop, Record]:
     first = loop.tick
-    return jax.lax.scan(
-        lambda loop, _: advance(simulator, loop, command, loop.tick == first),
-        loop,
-        None,
-        length=ticks,
-    )
+
+    def one(loop: Loop, _: None) -> tuple[Loop, Record]:
+        return advance(simulator, loop, command, loop.tick == first)
+
+    # A scan of one tick would be unrolled, and compiled to other last digits than one of many.
+    shapes = jax.eval_shape(one, loop, None)[1]
+    lines = jax.tree.map(lambda leaf: jnp.zeros((ticks, *leaf.shape), leaf.dtype), shapes)
+
+    def write(at: tuple[Loop, Record, Scalar]) -> tuple[Loop, Record, Scalar]:
+        loop, lines, i = at
+        loop, record = one(loop, None)
+        return loop, jax.tree.map(lambda line, new: line.at[i].set(new), lines, record), i + 1
+
+    last = first + ticks
+    loop, lines, _ = jax.lax.while_loop(lambda at: at[0].tick < last, write, (loop, lines, 0))
+    return loop, lines
 
 
 def tick(
@@ -282,11 +292,9 @@ def tick(
     def act(memory: Memory) -> Memory:
         return pilot.act(memory, heard(simulator, loop), loop.tick)[1]
 
-    now = loop.tick % pilot.control == 0
-    if pilot.control == 1:
-        memory = act(memory)
-    else:
-        memory = jax.lax.cond(now, act, lambda same: same, memory)
+    # Also where each tick has a decision: what is compiled apart comes to the same digits.
+    now = loop.tick % pilot.control == 0 if pilot.control > 1 else loop.tick >= 0
+    memory = jax.lax.cond(now, act, lambda same: same, memory)
     loop, record = advance(simulator, loop, memory.command, now)
     return loop, memory, record._replace(status=pilot.status(memory))
 

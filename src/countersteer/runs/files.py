@@ -109,7 +109,7 @@ def read_commands(path: Path) -> Table:
 
 def command_rows(time: np.ndarray, throttle: np.ndarray, steering: np.ndarray) -> list[list[str]]:
     """Rows of a `commands.csv`; throttle is negative in reverse, steering in rad."""
-    degrees = np.degrees(steering)
+    degrees = np.degrees(np.asarray(steering, float))
     return [
         [_cell(t), _cell(abs(u)), "reverse" if u < 0 else "forward", _cell(d)]
         for t, u, d in zip(time.tolist(), throttle.tolist(), degrees.tolist(), strict=True)
