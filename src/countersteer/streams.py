@@ -24,6 +24,7 @@ class Stream(IntEnum):
     WATCH = 9
     DRIVER = 10
     ESTIMATOR = 11
+    FLOOR = 12
 
 
 def root(seed: Scalar) -> jax.Array:
@@ -32,12 +33,6 @@ def root(seed: Scalar) -> jax.Array:
 
 
 def key(root: jax.Array, stream: Stream, tick: Scalar = None) -> jax.Array:
-    """The key of a stream, or of its draw at a tick."""
-    noise, driver = jax.random.split(root)
-    if stream == Stream.DRIVER:
-        return driver
-    if stream == Stream.ESTIMATOR:
-        return jax.random.fold_in(driver, 1)
-    if stream == Stream.WATCH:
-        return jax.random.fold_in(noise, 9)
-    return jax.random.fold_in(jax.random.fold_in(noise, tick), stream)
+    """The key of a stream that draws once, or of a stream's draw at a tick."""
+    own = jax.random.fold_in(root, stream)
+    return own if tick is None else jax.random.fold_in(own, tick)

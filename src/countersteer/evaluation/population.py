@@ -9,12 +9,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from countersteer import streams
 from countersteer.car.car import Car
 from countersteer.car.files import read_toml
 from countersteer.car.parameter import Declaration, changed, declarations, unknown_key
 from countersteer.course.course import Course
 from countersteer.errors import InputError
-from countersteer.signals import Array
+from countersteer.signals import Array, Scalar
+from countersteer.streams import Stream
 from countersteer.world import floor
 from countersteer.world.floor import LARGEST, Floor
 
@@ -178,8 +180,14 @@ def _floors(population: Population, seeds: Sequence[int], dtype: Any) -> Floor |
     if deviation == 0:
         return None
     with jax.enable_x64(False):  # else other numbers are drawn
-        keys = jax.vmap(jax.random.key)(np.asarray(seeds, np.int32))
-        drawn = jax.jit(jax.vmap(lambda key: floor.draw(key, deviation, length)))(keys)
+
+        @jax.jit
+        @jax.vmap
+        def laid(seed: Scalar) -> Floor:
+            key = streams.key(streams.root(seed), Stream.FLOOR)
+            return floor.draw(key, deviation, length)
+
+        drawn = laid(np.asarray(seeds, np.int32))
     cast: Floor = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), drawn)
     return cast
 
