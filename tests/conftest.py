@@ -213,4 +213,4 @@ def judged(course: Course | None, record: Record, dt: float = 0.001) -> tuple[Sc
     own = (record.motion, record.wall_contacts, record.rolled_over, record.status.turn)
     own = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], own)
     score, _ = task.follow(task.init(), Sample(dt * record.tick[rows], *own))
-    return score, turns.results(score.turns, float(score.time))
+    return score, turns.results(score.turns, score.handover, float(score.time))

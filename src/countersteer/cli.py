@@ -1206,6 +1206,7 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
             f"  turn {i}: in at {turn['entry_speed_mps']:.2f} m/s, "
             f"sideslip {turn['peak_sideslip_deg']:.0f}°, "
             f"yaw rate {turn['peak_yaw_rate_degps']:.0f} °/s, "
+            f"{turn['heading_overshoot_deg']:.0f}° too far and back, "
             f"out {turn['heading_error_deg']:+.1f}° off after {turn['duration_s']:.2f} s"
         )
     print(f"report: {folder / 'report.html'}")

@@ -120,6 +120,7 @@ def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
         "drift_share": float(np.mean(drifts[won])) if count else None,
         "heading_error_rms_deg": float(np.sqrt(np.mean(errors**2))) if errors.size else None,
         "peak_sideslip_deg_median": median(np.degrees(turns.peak_sideslip[won])),
+        **overshoot(np.degrees(turns.overshoot[won])),
         "entry_speed_mps_median": median(turns.entry_speed[won]),
         "lap_time_s_median": median(score.goal_time[won]),
         "failed_seeds": [int(seed) for seed in numbers[~won]],
@@ -127,6 +128,17 @@ def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
             Outcome.of(code).value: [int(seed) for seed in numbers[score.outcome == code]]
             for code in np.unique(score.outcome[~won])
         },
+    }
+
+
+def overshoot(degrees: np.ndarray) -> dict[str, float | None]:
+    """How far the heading goes beyond the corridor behind a turn: the median, and the 95 %."""
+    found = {"median": 50, "p95": 95}
+    return {
+        f"heading_overshoot_deg_{name}": float(np.percentile(degrees, part))
+        if degrees.size
+        else None
+        for name, part in found.items()
     }
 
 

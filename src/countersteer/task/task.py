@@ -17,7 +17,15 @@ from countersteer.course.along import Line, line_of
 from countersteer.course.course import Course
 from countersteer.signals import Array, Motion, Scalar
 from countersteer.task import turns as turning
-from countersteer.task.turns import LONGEST, ROUNDING, STRAIGHT_FOR, Turns, goes_straight
+from countersteer.task.turns import (
+    LONGEST,
+    ROUNDING,
+    STRAIGHT_FOR,
+    Approach,
+    Corners,
+    Turns,
+    goes_straight,
+)
 
 PERIOD = 0.005  # s between two samples that are judged, as in truth.csv
 STALLED = 5.0  # s without a step ahead
@@ -55,7 +63,7 @@ class Sample(NamedTuple):
     motion: Motion
     wall_contacts: Scalar
     rolled_over: Scalar
-    turn: Scalar  # turns that the driver has begun
+    turn: Scalar = 0  # turns that the driver says it has begun: recorded, and nothing else
 
 
 class Score(NamedTuple):
@@ -69,7 +77,9 @@ class Score(NamedTuple):
     stirred_at: Scalar  # last time at which the car was not going straight
     wall_contacts: Scalar
     time: Scalar  # of the last sample
+    handover: Array  # when the driver began each turn, by its own account (s); inf: never
     turns: Turns
+    approach: Approach
 
 
 @pytree
@@ -83,7 +93,7 @@ class Task:
     line: Line | None  # the centre line; None: there is no goal
     start: Scalar  # distance along it, m
     goal: Scalar  # m
-    bearings: Array  # (turns,) heading of the corridor behind each turn, rad
+    corners: Corners
     walls_end: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @classmethod
@@ -93,25 +103,24 @@ class Task:
         """For a course, in a precision."""
         number = np.dtype(dtype).type
         if course is None or course.goal_distance is None:
-            none = np.zeros(0, dtype)
-            return cls(line=None, start=number(0), goal=number(np.inf), bearings=none)
-        bearings = course.start[2] + np.cumsum([t.angle for t in course.turns_ahead(laps)])
+            none = Corners(*[np.zeros(0, dtype)] * 4)
+            return cls(line=None, start=number(0), goal=number(np.inf), corners=none)
         return cls(
             line=line_of(course, dtype),
             start=number(course.start_distance),
             goal=number(course.lap_end(laps)),
-            bearings=np.asarray(bearings, dtype),
+            corners=turning.corners_of(course, laps, dtype),
             walls_end=walls_end,
         )
 
     def init(self) -> Score:
         """Before the first sample."""
-        dtype = self.bearings.dtype
+        count, dtype = len(self.corners.angle), self.corners.angle.dtype
         zero, inf = dtype.type(0), dtype.type(np.inf)
-        none = turning.before_any(len(self.bearings), dtype)
-        start = self.start
+        never = np.full(count, np.inf, dtype)
         outcome = np.int32(Outcome.DRIVING.code)
-        return Score(outcome, start, start, zero, inf, zero, zero, zero, none)
+        at = (self.start, self.start, zero, inf, zero, zero, zero)
+        return Score(outcome, *at, never, *turning.before_any(count, dtype))
 
     def update(self, score: Score, sample: Sample) -> Score:
         """The score with one sample more; a drive that is over stays as it is."""
@@ -124,7 +133,11 @@ class Task:
         goal_time = jnp.where(reached, time, score.goal_time)
         stirred_at = jnp.where(goes_straight(motion), score.stirred_at, time)
         furthest_at = jnp.where(ahead, time, score.furthest_at)
-        turns = turning.follow(score.turns, self.bearings, motion, sample.turn, time)
+        speed = jnp.sqrt(motion.vx**2 + motion.vy**2)
+        seen = turning.approached(score.approach, distance, speed)
+        turns = turning.follow(score.turns, self.corners, seen, distance, motion, time)
+        handed = jnp.arange(len(score.handover)) < sample.turn
+        handover = jnp.where(handed & jnp.isinf(score.handover), time, score.handover)
         over = ~jnp.isinf(goal_time) & (
             (time - stirred_at >= STRAIGHT_FOR - ROUNDING) | (time - goal_time >= LONGEST)
         )
@@ -147,7 +160,9 @@ class Task:
             stirred_at,
             sample.wall_contacts,
             time,
+            handover,
             turns,
+            seen,
         )
         ended = score.outcome != Outcome.DRIVING.code
         return jax.tree.map(
@@ -187,6 +202,7 @@ def summary(score: Score, outcome: Outcome) -> dict[str, Any]:
         "wall_contacts": contacts,
         "lap_time_s": float(score.goal_time) if np.isfinite(score.goal_time) else None,
         "turns": [
-            dataclasses.asdict(turn) for turn in turning.results(score.turns, float(score.time))
+            dataclasses.asdict(turn)
+            for turn in turning.results(score.turns, score.handover, float(score.time))
         ],
     }

@@ -1,4 +1,11 @@
-"""The turns of a drive."""
+"""The turns of a drive, found from motion and course alone: whoever drives is judged alike.
+
+Turn k begins when the heading passes 15° into corner k, counted from the corridor before it, while
+the car is near that corner: within `NEAR` corridor widths of its arc, and of no corner nearer. It
+ends when yaw rate and sideslip have been under 30 °/s and 10° for 50 ms, having been above in it;
+at the latest after 2 s, or as the next turn begins. A spin on a straight is no turn, and a car that
+spins the wrong way near a corner has not begun to turn round it.
+"""
 
 import dataclasses
 import math
@@ -8,18 +15,42 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from countersteer.course.course import Course
 from countersteer.signals import Array, Motion, Scalar
 
+INTO = math.radians(15)  # heading into a corner at which its turn begins
 STRAIGHT_RATE, STRAIGHT_SLIP = math.radians(30), math.radians(10)
 STRAIGHT_FOR = 0.05  # s below both until a turn has ended
 LONGEST = 2.0  # s after which a turn has ended whatever the car does
-SLOW = 0.2  # m/s under which the direction of motion, and so sideslip, means nothing
+SLOW = 0.5  # m/s under which the direction of motion, and so sideslip, means nothing
 ROUNDING = 1e-4  # s, of a time in 32 bits
+NEAR = 1.5  # widths of the corridor
+BEFORE = 0.5  # m of centre line before a turn at which the speed of entry is taken
+MARK = 0.05  # m between two places whose speeds are kept
+MARKS = round(BEFORE / MARK) + 2
+
+
+class Corners(NamedTuple):
+    """The corners between start and goal: arrays of one number a corner."""
+
+    before: Array  # bearing of the corridor before it, rad; unwrapped from the start's
+    angle: Array  # by which it turns, positive to the left
+    near: Array  # distances along the line between which a car is near it, m
+    far: Array
+
+
+class Approach(NamedTuple):
+    """Speeds at the last places along the line, `MARK` apart; place i is kept in slot i % MARKS."""
+
+    speed: Array  # (MARKS,) m/s
+    last: Scalar  # number of the furthest place
 
 
 class Turns(NamedTuple):
     """What is known of each turn; arrays of one number a turn. Times are inf until they come."""
 
+    into: Array  # heading into the corner at the last sample, in ±pi; NaN where it was not near
+    spun: Array  # whole turns that the heading had run up as the turn began, rad
     begin: Array
     end: Array
     stirred: Array  # 1 once the car has not gone straight in it
@@ -27,7 +58,8 @@ class Turns(NamedTuple):
     entry_speed: Array
     peak_sideslip: Array
     peak_yaw_rate: Array
-    error: Array  # heading less the corridor's, at the end
+    overshoot: Array  # how far the heading went beyond the corridor behind, rad
+    error: Array  # heading less that corridor's, at the end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,13 +72,16 @@ class TurnResult:
     peak_sideslip_deg: float
     peak_yaw_rate_degps: float
     heading_error_deg: float
+    heading_overshoot_deg: float
     duration_s: float
+    handover_s: float | None  # when the driver said that it began the turn; None: it never did
 
 
 def sideslip(vx: Array, vy: Array) -> Array:
-    """Angle from the nose to the velocity (rad); 0 where the car all but stands."""
+    """Angle from the nose to the velocity (rad); 0 where the car all but stands, or goes back."""
     own = jnp if isinstance(vx, jax.Array) else np  # NumPy's arrays keep their precision
-    return own.where(vx**2 + vy**2 > SLOW**2, own.arctan2(vy, vx), 0.0)
+    counts = (vx**2 + vy**2 > SLOW**2) & (vx > 0)
+    return own.where(counts, own.arctan2(vy, own.where(counts, vx, 1.0)), 0.0)
 
 
 def goes_straight(motion: Motion) -> Scalar:
@@ -55,43 +90,93 @@ def goes_straight(motion: Motion) -> Scalar:
     return (jnp.abs(motion.yaw_rate) < STRAIGHT_RATE) & (jnp.abs(slip) < STRAIGHT_SLIP)
 
 
-def before_any(count: int, dtype: Any) -> Turns:
+def corners_of(course: Course, laps: int, dtype: Any) -> Corners:
+    """The corners of a course with a centre line, in the order driven."""
+    turns = course.turns_ahead(laps)
+    angles = np.array([turn.angle for turn in turns])
+    places = np.array([turn.distance for turn in turns])
+    reach = NEAR * (course.width or 1.0) + np.array([abs(t.angle) * t.radius / 2 for t in turns])
+    middles = (places[1:] + places[:-1]) / 2
+    ends = np.concatenate([[-np.inf], middles, [np.inf]]) if turns else np.zeros(1)
+    before = course.start[2] + np.cumsum(angles) - angles
+    nearest = np.maximum(ends[:-1], places - reach), np.minimum(ends[1:], places + reach)
+    return Corners(*(np.asarray(column, dtype) for column in (before, angles, *nearest)))
+
+
+def before_any(count: int, dtype: Any) -> tuple[Turns, Approach]:
     """So many turns, none of which has begun."""
     never, zero = np.full(count, np.inf, dtype), np.zeros(count, dtype)
-    return Turns(never, never, zero, zero, zero, zero, zero, zero)
+    none = np.full(count, np.nan, dtype)
+    turns = Turns(none, zero, never, never, *[zero] * 7)
+    return turns, Approach(np.zeros(MARKS, dtype), np.int32(-(2**30)))
 
 
-def follow(old: Turns, bearings: Array, motion: Motion, turn: Scalar, time: Scalar) -> Turns:
-    """The turns with one sample more. `bearings` are those of the corridors behind them."""
-    speed, rate = jnp.sqrt(motion.vx**2 + motion.vy**2), jnp.abs(motion.yaw_rate)
-    slip, calm = jnp.abs(sideslip(motion.vx, motion.vy)), goes_straight(motion)
-    begins = jnp.isinf(old.begin) & (jnp.arange(old.begin.shape[0]) < turn)
+def approached(old: Approach, distance: Scalar, speed: Scalar) -> Approach:
+    """The speeds with one sample more."""
+    here = jnp.floor(distance / MARK).astype(jnp.int32)
+    places = here - (here - jnp.arange(MARKS)) % MARKS  # that the slots are of by now
+    return Approach(jnp.where(places > old.last, speed, old.speed), jnp.maximum(old.last, here))
+
+
+def speed_before(seen: Approach, distance: Scalar) -> Scalar:
+    """The speed that the car had `BEFORE` metres of centre line ago."""
+    at = (distance - BEFORE) / MARK
+    place = jnp.floor(at)
+    slot = place.astype(jnp.int32) + jnp.arange(2)
+    first, second = seen.speed[slot[0] % MARKS], seen.speed[slot[1] % MARKS]
+    return first + (at - place) * (second - first)
+
+
+def follow(
+    old: Turns, corners: Corners, seen: Approach, distance: Scalar, motion: Motion, time: Scalar
+) -> Turns:
+    """The turns with one sample more, at a distance along the line."""
+    rate, slip = jnp.abs(motion.yaw_rate), jnp.abs(sideslip(motion.vx, motion.vy))
+    calm, hand = goes_straight(motion), jnp.sign(corners.angle)
+    off = motion.heading - corners.before
+    near = (distance >= corners.near) & (distance < corners.far)
+    turns = 2 * math.pi * jnp.round(off / (2 * math.pi))
+    into = hand * (off - turns)
+    # From one sample to the next a heading that jumps by a turn has not passed anything.
+    passes = jnp.isnan(old.into) | ((old.into < INTO) & (into - old.into < math.pi))
+    begins = jnp.isinf(old.begin) & near & (into >= INTO) & passes
+    spun = jnp.where(begins, turns, old.spun)
     begin = jnp.where(begins, time, old.begin)
     under_way = (begin <= time) & jnp.isinf(old.end)
     stirred = jnp.where(under_way & ~calm, 1.0, old.stirred)
     calm_since = jnp.where(calm & ~begins, old.calm_since, time)
     late = time - begin >= LONGEST - ROUNDING
     settled = (stirred > 0) & calm & (time - calm_since >= STRAIGHT_FOR - ROUNDING)
-    ends = under_way & (late | settled)
-    error = motion.heading - bearings
+    ends = under_way & (late | settled | (jnp.any(begins) & ~begins))
+    beyond = hand * (off - spun) - jnp.abs(corners.angle)
+    error = hand * beyond
     error = error - 2 * math.pi * jnp.round(error / (2 * math.pi))
+
+    def peak(now: Scalar, before: Array) -> Array:
+        return jnp.where(under_way, jnp.maximum(before, now), before)
+
     return Turns(
+        jnp.where(near, into, jnp.nan),
+        spun,
         begin,
         jnp.where(ends, time, old.end),
         stirred,
         calm_since,
-        jnp.where(begins, speed, old.entry_speed),
-        jnp.where(under_way, jnp.maximum(old.peak_sideslip, slip), old.peak_sideslip),
-        jnp.where(under_way, jnp.maximum(old.peak_yaw_rate, rate), old.peak_yaw_rate),
+        jnp.where(begins, speed_before(seen, distance), old.entry_speed),
+        peak(slip, old.peak_sideslip),
+        peak(rate, old.peak_yaw_rate),
+        peak(beyond, old.overshoot),
         jnp.where(under_way, error, old.error),
     )
 
 
-def results(turns: Turns, time: float) -> list[TurnResult]:
-    """Those that have begun. One that is under way ends at `time`, when the drive did."""
-    begun = np.nonzero(np.isfinite(turns.begin))[0]
+def results(turns: Turns, handover: Array, time: float) -> list[TurnResult]:
+    """Those that have begun. One that is under way ends at `time`, when the drive did.
+
+    `handover` has the times at which the driver began its turns, inf where it did not.
+    """
     found = []
-    for i in begun.tolist():
+    for i in np.nonzero(np.isfinite(turns.begin))[0].tolist():
         begin, end = float(turns.begin[i]), min(float(turns.end[i]), time)
         found.append(
             TurnResult(
@@ -101,7 +186,9 @@ def results(turns: Turns, time: float) -> list[TurnResult]:
                 peak_sideslip_deg=math.degrees(turns.peak_sideslip[i]),
                 peak_yaw_rate_degps=math.degrees(turns.peak_yaw_rate[i]),
                 heading_error_deg=math.degrees(turns.error[i]),
+                heading_overshoot_deg=math.degrees(turns.overshoot[i]),
                 duration_s=end - begin,
+                handover_s=float(handover[i]) if math.isfinite(handover[i]) else None,
             )
         )
     return found

@@ -8,26 +8,75 @@ drift and the heading at the start are in both.
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
+from countersteer.car.parameter import pytree
 from countersteer.course.course import Course, Turn
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.evaluation.experiments.found import Found, Report, silent
 from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.rollout import rollouts
-from countersteer.pilot import Pilot
+from countersteer.evaluation.rollout import watched
+from countersteer.pilot import Memory, Pilot
+from countersteer.signals import Scalar
+from countersteer.simulator import Loop, Simulator
+from countersteer.task.task import Score
+from countersteer.task.turns import ROUNDING, STRAIGHT_FOR, goes_straight
 
 TRIALS = 1000
-TURNS = 4
+TURNS, ANGLE = 4, -math.pi / 2
 SPEED = 2.0  # m/s
 LONGEST = 12.0  # s
 FAR = 1e4  # m
 
 
-def open_floor(angle: float = -math.pi / 2) -> Course:
+class Kept(NamedTuple):
+    """Of a trial: how its last turn goes."""
+
+    stirred: Scalar  # 1 once the car has not gone straight in it
+    calm_since: Scalar  # s
+    heading: Scalar  # rad, once the car has gone straight for 50 ms behind it; NaN before
+
+
+@pytree
+class LastTurn:
+    """Looks at the heading behind the driver's last turn: no corridor tells where it ends."""
+
+    def begin(self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory) -> Kept:
+        """Nothing yet."""
+        del pilot, memory
+        zero = jnp.zeros_like(simulator.world.motion(loop.state).x)
+        return Kept(zero, zero, zero + jnp.nan)
+
+    def look(
+        self,
+        simulator: Simulator,
+        pilot: Pilot,
+        loop: Loop,
+        memory: Memory,
+        score: Score,
+        kept: Kept,
+    ) -> Kept:
+        """One instant more."""
+        del score
+        motion = simulator.world.motion(loop.state)
+        time = simulator.dt * loop.tick.astype(motion.x.dtype)
+        turns, calm = pilot.status(memory).turn >= TURNS, goes_straight(motion)
+        stirred = jnp.where(turns & ~calm, 1.0, kept.stirred)
+        since = jnp.where(calm, kept.calm_since, time)
+        ends = (stirred > 0) & calm & (time - since >= STRAIGHT_FOR - ROUNDING)
+        heading = jnp.where(ends & jnp.isnan(kept.heading), motion.heading, kept.heading)
+        return Kept(stirred, since, heading)
+
+    def end(self, kept: Kept) -> Kept:
+        """All of it."""
+        return kept
+
+
+def open_floor(angle: float = ANGLE) -> Course:
     """A line without walls, and turns that nothing but the driver brings about."""
     line = np.array([[0.0, 0.0], [FAR, 0.0]])
     turns = tuple(Turn(float(n), angle) for n in range(1, TURNS + 1))
@@ -42,7 +91,7 @@ def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS)
     errors = {}
     for i, (label, carry) in enumerate((("carried over", 1.0), ("each by itself", 0.0))):
         driver = dataclasses.replace(drift_turn(course, car, SPEED), linked=1.0, carry=carry)
-        score = rollouts(
+        _, kept = watched(
             course,
             Pilot.of(driver, course, car),
             drawn,
@@ -50,11 +99,11 @@ def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS)
             seeds,
             1,
             LONGEST,
+            LastTurn(),
             lambda done, of, i=i: report(i * of + done, 2 * of),  # type: ignore[misc]  # one type
         )
-        error = np.degrees(score.turns.error[:, -1])
-        ended = np.isfinite(score.turns.end[:, -1])
-        errors[label] = np.where(ended, error, math.nan)
+        off = kept.heading - TURNS * ANGLE
+        errors[label] = np.degrees(np.arctan2(np.sin(off), np.cos(off)))
     figures = {label: _figures(values) for label, values in errors.items()}
     said = "; ".join(
         f"{label}: {f['rms_deg']:.1f}° RMS, {100 * f['within_10_deg']:.0f} % within 10°, "
