@@ -126,6 +126,45 @@ def test_a_spin_before_another_corner_does_not_count_for_this_one():
     assert dataclasses.asdict(after) == pytest.approx(dataclasses.asdict(second), abs=1e-6)
 
 
+def test_what_goes_too_far_in_one_turn_is_not_into_the_next():
+    """Half way to the next corner, of the same hand, the car is still 50° too far."""
+    two = from_segments(
+        "two", 1.4, False,
+        [("straight", 4.0, 0.0), ("turn", -math.pi / 2, 0.0), ("straight", 2.0, 0.0),
+         ("turn", -math.pi / 2, 0.0), ("straight", 3.0, 0.0)],
+    )  # fmt: skip
+    points = [
+        (0, 0),
+        (1.8, 0),
+        (2.2, -140),
+        (2.55, -140),
+        (2.7, -90),
+        (2.9, -90),
+        (3.1, -180),
+        (6, -180),
+    ]
+    _, (first, second) = judge(two, path(two, 2.0, points, [(2.0, 0), (2.2, 40), (2.7, 0)], 4.4))
+    assert first.heading_overshoot_deg == pytest.approx(50, abs=0.5)
+    assert first.heading_error_deg == pytest.approx(0, abs=0.5)
+    assert second.begin_s == pytest.approx(2.9 + 0.2 * 15 / 90, abs=0.006)
+    assert second.heading_error_deg == pytest.approx(0, abs=0.5)
+
+
+def test_turns_of_a_slalom_are_linked():
+    """The other hand begins while the first has not ended, and ends it."""
+    ess = from_segments(
+        "slalom", 1.4, False,
+        [("straight", 4.0, 0.0), ("turn", -math.pi / 3, 0.0), ("straight", 1.0, 0.0),
+         ("turn", math.pi / 3, 0.0), ("straight", 3.0, 0.0)],
+    )  # fmt: skip
+    points = [(0, 0), (1.8, 0), (2.2, -75), (2.6, 20), (2.8, 0), (6, 0)]
+    _, (first, second) = judge(ess, path(ess, 2.0, points, time=3.9))
+    assert first.end_s == pytest.approx(second.begin_s)
+    assert first.heading_overshoot_deg == pytest.approx(15, abs=0.6)
+    assert second.heading_overshoot_deg == pytest.approx(20, abs=0.6)
+    assert second.heading_error_deg == pytest.approx(0, abs=0.5)
+
+
 def test_a_reversing_car_has_no_sideslip():
     """All of the corner backwards: nose away from where it goes, which is no drift of 180°."""
     points = [(t, h) for t, h in CLEAN]
@@ -133,7 +172,17 @@ def test_a_reversing_car_has_no_sideslip():
     assert turn.peak_sideslip_deg == 0
     assert turn.heading_error_deg == pytest.approx(0, abs=0.5)
     assert turn.entry_speed_mps == pytest.approx(2.0, abs=1e-6)
+    assert turn.duration_s == pytest.approx(2.0, abs=0.006)  # backwards is not straight on
     assert Outcome.of(score.outcome) == Outcome.REACHED
+
+
+def test_a_car_that_slows_down_in_its_slide_has_not_ended_its_turn():
+    """At 0.4 m/s, where the heading comes back: sideslip counts for nothing, but it is there."""
+    speed = [(0, 2.0), (1.8, 2.0), (2.3, 0.4), (2.7, 0.4), (3.2, 1.5), (6, 1.5)]
+    points = [(0, 0), (1.8, 0), (2.2, -90), (2.4, -115), (2.6, -115), (2.9, -90), (6, -90)]
+    _, (turn,) = judge(RIGHT, path(RIGHT, speed, points, [(2.0, 0), (2.2, 40), (2.7, 40), (3, 0)]))
+    assert turn.heading_error_deg == pytest.approx(0, abs=0.5)
+    assert turn.end_s > 2.9
 
 
 def test_a_car_that_creeps_has_no_sideslip_and_stalls_only_where_it_stands():
@@ -164,7 +213,8 @@ def by_definition(course, record):
     time, m = 0.001 * record.tick[every], jax.tree.map(lambda leaf: leaf[every], record.motion)
     speed, rate = np.hypot(m.vx, m.vy), np.abs(m.yaw_rate)
     slip = np.where((speed > 0.5) & (m.vx > 0), np.abs(np.arctan2(m.vy, m.vx)), 0.0)
-    calm = (rate < math.radians(30)) & (slip < math.radians(10))
+    aside = np.where(speed > 0.2, np.abs(np.arctan2(m.vy, m.vx)), 0.0)
+    calm = (rate < math.radians(30)) & (aside < math.radians(10))
     from countersteer.course.course import progress
 
     along = progress(course, m.x, m.y, course.start_distance)

@@ -657,7 +657,7 @@ def run_replay(options: argparse.Namespace) -> int:
     commands = run.commands if run else read_commands(options.source)
     pose, velocity = read_initial(options.initial)
     if run is not None and not options.initial:
-        begin = run.about.get("course", {}).get("start") or run.about.get("start")
+        begin = run.about.get("start") or run.about.get("course", {}).get("start")
         if begin:
             pose = (begin["x_m"], begin["y_m"], begin["heading_rad"])
         first = run.about.get("initial", {})

@@ -22,7 +22,8 @@ INTO = math.radians(15)  # heading into a corner at which its turn begins
 STRAIGHT_RATE, STRAIGHT_SLIP = math.radians(30), math.radians(10)
 STRAIGHT_FOR = 0.05  # s below both until a turn has ended
 LONGEST = 2.0  # s after which a turn has ended whatever the car does
-SLOW = 0.5  # m/s under which the direction of motion, and so sideslip, means nothing
+SLOW = 0.5  # m/s under which sideslip does not count
+STANDS = 0.2  # m/s under which the direction of motion means nothing
 ROUNDING = 1e-4  # s, of a time in 32 bits
 NEAR = 1.5  # widths of the corridor
 BEFORE = 0.5  # m of centre line before a turn at which the speed of entry is taken
@@ -49,8 +50,8 @@ class Approach(NamedTuple):
 class Turns(NamedTuple):
     """What is known of each turn; arrays of one number a turn. Times are inf until they come."""
 
-    into: Array  # heading into the corner at the last sample, in ±pi; NaN where it was not near
-    spun: Array  # whole turns that the heading had run up as the turn began, rad
+    into: Array  # heading into the corner at the last sample
+    spun: Array  # whole turns (rad) that do not count for it; NaN while the car is not near
     begin: Array
     end: Array
     stirred: Array  # 1 once the car has not gone straight in it
@@ -85,9 +86,15 @@ def sideslip(vx: Array, vy: Array) -> Array:
 
 
 def goes_straight(motion: Motion) -> Scalar:
-    """Whether yaw rate and sideslip are both under what ends a turn."""
-    slip = sideslip(motion.vx, motion.vy)
-    return (jnp.abs(motion.yaw_rate) < STRAIGHT_RATE) & (jnp.abs(slip) < STRAIGHT_SLIP)
+    """Whether yaw rate and sideslip are both under what ends a turn.
+
+    Here sideslip counts down to `STANDS`, and backwards too: a car that has slowed down in the
+    middle of a slide, or goes backwards out of a spin, does not go straight.
+    """
+    vx, vy = motion.vx, motion.vy
+    ahead = (vx > 0) & (jnp.abs(vy) < math.tan(STRAIGHT_SLIP) * vx)
+    stands = vx**2 + vy**2 < STANDS**2
+    return (jnp.abs(motion.yaw_rate) < STRAIGHT_RATE) & (ahead | stands)
 
 
 def corners_of(course: Course, laps: int, dtype: Any) -> Corners:
@@ -107,7 +114,7 @@ def before_any(count: int, dtype: Any) -> tuple[Turns, Approach]:
     """So many turns, none of which has begun."""
     never, zero = np.full(count, np.inf, dtype), np.zeros(count, dtype)
     none = np.full(count, np.nan, dtype)
-    turns = Turns(none, zero, never, never, *[zero] * 7)
+    turns = Turns(none, none, never, never, *[zero] * 7)
     return turns, Approach(np.zeros(MARKS, dtype), np.int32(-(2**30)))
 
 
@@ -133,14 +140,18 @@ def follow(
     """The turns with one sample more, at a distance along the line."""
     rate, slip = jnp.abs(motion.yaw_rate), jnp.abs(sideslip(motion.vx, motion.vy))
     calm, hand = goes_straight(motion), jnp.sign(corners.angle)
-    off = motion.heading - corners.before
+    off, whole = motion.heading - corners.before, 2 * math.pi
     near = (distance >= corners.near) & (distance < corners.far)
-    turns = 2 * math.pi * jnp.round(off / (2 * math.pi))
-    into = hand * (off - turns)
-    # From one sample to the next a heading that jumps by a turn has not passed anything.
-    passes = jnp.isnan(old.into) | ((old.into < INTO) & (into - old.into < math.pi))
-    begins = jnp.isinf(old.begin) & near & (into >= INTO) & passes
-    spun = jnp.where(begins, turns, old.spun)
+    spun = jnp.where(jnp.isnan(old.spun), whole * jnp.round(off / whole), old.spun)
+    # All the way round the wrong way is as if it had not been.
+    back = jnp.isinf(old.begin) & (hand * (off - spun) < INTO - whole)
+    spun = jnp.where(back, spun - hand * whole, spun)
+    into = hand * (off - spun)
+    # What goes too far in one turn is not into the next of the same hand.
+    in_turn = (old.begin <= time) & jnp.isinf(old.end)
+    same = jnp.any(in_turn & (hand == hand[:, None]), axis=1)
+    passes = (old.into < INTO) & (into - old.into < math.pi)
+    begins = jnp.isinf(old.begin) & near & (into >= INTO) & (passes | ~same)
     begin = jnp.where(begins, time, old.begin)
     under_way = (begin <= time) & jnp.isinf(old.end)
     stirred = jnp.where(under_way & ~calm, 1.0, old.stirred)
@@ -148,7 +159,7 @@ def follow(
     late = time - begin >= LONGEST - ROUNDING
     settled = (stirred > 0) & calm & (time - calm_since >= STRAIGHT_FOR - ROUNDING)
     ends = under_way & (late | settled | (jnp.any(begins) & ~begins))
-    beyond = hand * (off - spun) - jnp.abs(corners.angle)
+    beyond = into - jnp.abs(corners.angle)
     error = hand * beyond
     error = error - 2 * math.pi * jnp.round(error / (2 * math.pi))
 
@@ -156,8 +167,8 @@ def follow(
         return jnp.where(under_way, jnp.maximum(before, now), before)
 
     return Turns(
-        jnp.where(near, into, jnp.nan),
-        spun,
+        into,
+        jnp.where(near | jnp.isfinite(begin), spun, jnp.nan),
         begin,
         jnp.where(ends, time, old.end),
         stirred,
