@@ -177,7 +177,7 @@ def test_open_loop_plays_its_commands_from_where_the_turn_begins_and_then_gives_
 
 
 def test_every_experiment_has_a_name_a_word_and_a_module():
-    assert tuple(experiments.NAMES) == cli.EXPERIMENTS
+    assert tuple(experiments.NAMES) == cli.experiment.EXPERIMENTS
     for name in experiments.NAMES:
         assert callable(experiments.load(name).simulate)
 

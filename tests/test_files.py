@@ -253,7 +253,7 @@ def test_drives_at_once_get_folders_of_their_own(tmp_path, monkeypatch):
 def test_the_box_states_its_grip_speed():
     course = load_course("box")
     speed = grip_speed(course, load_car("rx7"))
-    text = (Path(cli.__file__).parent / "course" / "library" / "box.toml").read_text()
+    text = (Path(cli.__file__).parents[1] / "course" / "library" / "box.toml").read_text()
     assert f"{speed:.2f} m/s" in text
 
 
@@ -406,7 +406,7 @@ def test_a_run_that_is_there_is_moved_aside(tmp_path, capsys):
 def start(tmp_path: Path, *arguments: str, **options: object) -> subprocess.Popen:
     """The command in a process of its own."""
     return subprocess.Popen(
-        [sys.executable, "-m", "countersteer.cli", *arguments],
+        [sys.executable, "-m", "countersteer", *arguments],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

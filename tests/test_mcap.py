@@ -28,7 +28,7 @@ from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.runs.mcap import McapWriter
 
-LAYOUT = Path(cli.__file__).parent / "viewing" / "foxglove_layout.json"
+LAYOUT = Path(cli.__file__).parents[1] / "viewing" / "foxglove_layout.json"
 TABLES = ("commands", "telemetry", "truth")
 
 
@@ -213,7 +213,7 @@ def test_what_is_left_of_a_file_cut_anywhere_still_reads(box):
 
 def test_a_killed_drive_leaves_what_the_tables_have(tmp_path):
     folder = tmp_path / "run"
-    command = ["-m", "countersteer.cli", "drive", "box", "--laps", "500", "--out", str(folder)]
+    command = ["-m", "countersteer", "drive", "box", "--laps", "500", "--out", str(folder)]
     process = subprocess.Popen([sys.executable, *command], stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 120

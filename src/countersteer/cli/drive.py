@@ -1,0 +1,129 @@
+"""`drive`: one closed-loop drive over a course."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from countersteer.cli.options import (
+    DRIVERS,
+    SPEEDS,
+    Verbs,
+    check_laps,
+    laps_and_link,
+    number,
+    physics,
+)
+from countersteer.cli.record import record
+from countersteer.errors import InputError
+
+if TYPE_CHECKING:
+    from countersteer.car.car import Car
+    from countersteer.course.course import Course
+
+
+def add(verbs: Verbs) -> None:
+    """The verb with its options."""
+    drive = verbs.verb("drive", "one closed-loop drive over a course", run)
+    drive.add_argument(
+        "course",
+        metavar="COURSE",
+        help="library name, or a file: .toml, a centre line with widths .csv (F1TENTH), "
+        "a map .yaml with its image (ROS)",
+    )
+    drive.add_argument(
+        "--driver",
+        default="drift-turn",
+        help=f"{', '.join(DRIVERS)}, a plan's name, a policy or plan .toml, or a commands.csv "
+        "(default drift-turn)",
+    )
+    physics(drive, "rx7")
+    drive.add_argument(
+        "--speed-mps",
+        type=SPEEDS,
+        default=None,
+        metavar="V",
+        help="speed that the driver is asked to bring to a turn (default the driver's); with "
+        "--cars also LO:HI",
+    )
+    drive.add_argument(
+        "--cars",
+        metavar="SET",
+        help="drive the car, charge and start that --seed draws from this set, as evaluate does",
+    )
+    drive.add_argument(
+        "--battery", type=number(0, 1), metavar="F", help="charge, 0 to 1 (default 1)"
+    )
+    drive.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="TEXT",
+        help="a sensor that is dead, stuck or spiking for a while: 'SENSOR KIND START DURATION' in "
+        "seconds, such as 'gyroscope stuck 2.0 0.5' (repeatable)",
+    )
+    laps_and_link(drive)
+
+
+def run(options: argparse.Namespace) -> int:
+    """`drive`."""
+    from countersteer.car.files import load_car
+    from countersteer.course.files import load_course
+    from countersteer.drivers.library import make_driver
+    from countersteer.evaluation.drive import about_run
+    from countersteer.link.link import LINKS
+    from countersteer.pilot import Pilot
+    from countersteer.runs.files import read_commands
+    from countersteer.sensing.faults import read_fault
+    from countersteer.simulator import Simulator
+
+    course, car = load_course(options.course), load_car(options.car, options.set)
+    check_laps(options, course)
+    charge, start, speed, floor = 1.0, None, None, None
+    if options.battery is not None:
+        charge = options.battery
+    if options.cars is not None:
+        if options.battery is not None:
+            raise InputError("--battery: --cars draws the charge")
+        car, charge, start, speed, floor = drawn_alone(options, course, car)
+    elif options.speed_mps is not None:
+        speed, most = options.speed_mps
+        if most != speed:
+            raise InputError("--speed-mps LO:HI: a range is drawn from with --cars only")
+    nominal, link = load_car(options.car), LINKS[options.link]
+    driver, tables = make_driver(
+        options.driver, course, nominal, speed, options.laps, read_commands
+    )
+    made = options.driver.endswith((".csv", ".toml"))
+    name = Path(options.driver).stem if made else options.driver
+    pilot = Pilot.of(driver, course, nominal, options.estimate, link, options.dt)
+    simulator = Simulator.of(
+        course,
+        car,
+        link=link,
+        dt=options.dt,
+        seed=options.seed,
+        charge=charge,
+        start=start,
+        floor=floor,
+        faults=tuple(read_fault(text) for text in options.fault),
+    )
+    about = about_run(simulator, pilot, course, name, options.car, options.laps, nominal, tables)
+    # A lap at a crawl still ends.
+    longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
+    return record(options, simulator, pilot, course, about, longest, course.name)
+
+
+def drawn_alone(options: argparse.Namespace, course: "Course", car: "Car") -> tuple[Any, ...]:
+    """The trial of `--seed`: car, charge, start, speed asked for and floor."""
+    import jax
+    import numpy as np
+
+    from countersteer.evaluation.population import draw, load_population
+
+    drawn = draw(
+        load_population(options.cars), car, course, [options.seed], np.float32, options.speed_mps
+    )
+    speed = None if drawn.speed is None else float(drawn.speed[0])
+    x, y, heading = (float(value) for value in drawn.pose[0])
+    alone, floor = jax.tree.map(lambda leaf: leaf[0], (drawn.cars, drawn.floor))
+    return alone, float(drawn.charge[0]), (x, y, heading), speed, floor

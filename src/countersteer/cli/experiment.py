@@ -1,0 +1,62 @@
+"""`experiment`: the paper's measurements."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+from countersteer.cli.options import DONE, Progress, Verbs, nominal_car
+from countersteer.errors import InputError
+
+EXPERIMENTS = (
+    "turn-rate", "drift-threshold", "stop-time", "drift-turn", "control-rate", "battery",
+    "linked-turns", "narrowest-corner",
+)  # fmt: skip
+
+
+def add(verbs: Verbs) -> None:
+    """The verb with its options."""
+    experiment = verbs.verb("experiment", "the paper's measurements", run)
+    experiment.add_argument(
+        "name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS)
+    )
+    nominal_car(experiment)
+    experiment.add_argument(
+        "--from",
+        dest="runs",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUN",
+        help="measure in these runs' folders instead, of a real car or a simulated one",
+    )
+    experiment.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
+
+
+def run(options: argparse.Namespace) -> int:
+    """`experiment`."""
+    from countersteer.car.files import load_car
+    from countersteer.evaluation import experiments
+    from countersteer.evaluation.experiments.found import write
+    from countersteer.runs.recorder import new_folder
+    from countersteer.runs.run import read_run
+    from countersteer.simulator import keep_programs
+
+    # Only the closed loop is worth its time in a compiler that makes a function of it.
+    closed = options.name in ("control-rate", "linked-turns")
+    keep_programs(blocks=closed, cores=os.cpu_count() or 1)
+    module, car = experiments.load(options.name), load_car(options.car, options.set)
+    if options.runs and not hasattr(module, "measure"):
+        raise InputError(f"--from: {options.name} is simulated, and measures no run")
+    folder = new_folder(options.out, options.name)
+    with Progress(options.json) as progress:
+        if options.runs:
+            found = module.measure([read_run(path) for path in options.runs])
+        else:
+            found = module.simulate(car, Path(options.car).stem, progress.show)
+    result = write(found, folder, options.name)
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+    else:
+        print(f"{found.text}\ntable, picture: {folder}")
+    return DONE

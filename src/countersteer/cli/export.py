@@ -1,0 +1,84 @@
+"""`export`: a run seen from above, as a GIF or an MP4."""
+
+import argparse
+import json
+import signal
+from pathlib import Path
+
+from countersteer.cli.options import DONE, Progress, Verbs, number
+from countersteer.errors import InputError
+
+FASTEST_GIF = 50  # frames a second
+
+
+def add(verbs: Verbs) -> None:
+    """The verb with its options."""
+    export = verbs.verb("export", "a run seen from above, as a GIF or an MP4", run)
+    export.add_argument("source", type=Path, metavar="RUN", help="a run's folder")
+    target = export.add_mutually_exclusive_group(required=True)
+    target.add_argument("--gif", type=Path, metavar="FILE", help="write an animated GIF")
+    target.add_argument("--mp4", type=Path, metavar="FILE", help="write a video (H.264)")
+    export.add_argument(
+        "--width-px", type=number(160, 3840, int), default=640, metavar="PX", help="default 640"
+    )
+    export.add_argument(
+        "--fps", type=number(1, 100), metavar="N", help="frames a second (default GIF 20, MP4 25)"
+    )
+    export.add_argument(
+        "--speed",
+        type=number(0.01, 100),
+        default=1.0,
+        metavar="X",
+        help="times as fast as it was; 0.5 is slow motion (default 1)",
+    )
+    export.add_argument("--follow", action="store_true", help="the camera stays with the car")
+    export.add_argument(
+        "--from-s", type=number(0, 1e6), default=0.0, metavar="S", help="begin (default the run's)"
+    )
+    export.add_argument(
+        "--to-s", type=number(0, 1e6), default=1e6, metavar="S", help="end (default the run's)"
+    )
+    export.add_argument("--force", action="store_true", help="replace a file that is there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """`export`."""
+    from countersteer.runs.run import read_run
+    from countersteer.viewing.animation import Animation, Options, export
+
+    kind, file = ("gif", options.gif) if options.gif else ("mp4", options.mp4)
+    if file.is_dir():
+        raise InputError(f"{file}: is a folder: name a file")
+    if file.exists() and not options.force:
+        raise InputError(f"{file}: is there already: give another name, or --force to replace it")
+    if not file.parent.is_dir():
+        raise InputError(f"{file.parent}: no such folder")
+    fps = options.fps or {"gif": 20.0, "mp4": 25.0}[kind]
+    if kind == "gif" and fps > FASTEST_GIF:
+        raise InputError(f"--fps must be at most {FASTEST_GIF} for a GIF: viewers slow others down")
+    drawn = Options(
+        options.width_px, fps, options.speed, options.follow, options.from_s, options.to_s
+    )
+    animation = Animation(read_run(options.source), drawn)
+    # What was begun is taken away again: the exception has to come through.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with Progress(options.json) as progress:
+            export(animation, file, kind, progress.show)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    width, height = animation.size
+    result = {
+        "file": str(file),
+        "frames": animation.count,
+        "duration_s": animation.duration,
+        "fps": fps,
+        "width_px": width,
+        "height_px": height,
+    }
+    if options.json:
+        print(json.dumps(result))
+    else:
+        size = file.stat().st_size / 1e6
+        print(f"{file}: {animation.count} frames, {animation.duration:.1f} s, {size:.1f} MB")
+    return DONE

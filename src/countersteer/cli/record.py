@@ -1,0 +1,68 @@
+"""What `drive` and `replay` share: a drive that is recorded and shown."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from countersteer.cli.options import DONE, FAILED, INTERRUPTED, Progress
+
+if TYPE_CHECKING:
+    from countersteer.course.course import Course
+    from countersteer.pilot import Pilot
+    from countersteer.simulator import Simulator
+
+
+def record(
+    options: argparse.Namespace,
+    simulator: "Simulator",
+    pilot: "Pilot",
+    course: "Course | None",
+    about: dict[str, Any],
+    longest: float,
+    place: str,
+) -> int:
+    """Drives, writes the run's folder with its pictures, and prints what came of it."""
+    from countersteer.evaluation.drive import drive
+    from countersteer.runs.recorder import new_folder
+    from countersteer.runs.run import read_run
+    from countersteer.simulator import keep_programs
+    from countersteer.viewing.picture import Painter
+    from countersteer.viewing.report import report_html
+    from countersteer.viewing.view import view_of
+
+    keep_programs(batches=False)
+    folder = new_folder(options.out, f"{Path(place).stem}-{about['driver']}")
+    painter = Painter(folder / "report.png")
+    with Progress(options.json) as progress:
+        result = drive(
+            simulator, pilot, course, folder, about, about["laps"], longest, progress.show
+        )
+    view = view_of(read_run(folder))
+    (folder / "report.html").write_text(report_html(view))
+    painter.draw(view)
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+    else:
+        print_result(result, folder)
+    if result["status"] == "interrupted":
+        print("countersteer: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return DONE if result["success"] else FAILED
+
+
+def print_result(result: dict[str, Any], folder: Path) -> None:
+    """The summary for a person."""
+    lap = f" in {result['lap_time_s']:.2f} s" if result["lap_time_s"] else ""
+    touched = result["wall_contacts"]
+    print(f"{result['status']}{lap}, {touched} wall contact{'s' if touched != 1 else ''}")
+    for i, turn in enumerate(result["turns"], start=1):
+        print(
+            f"  turn {i}: in at {turn['entry_speed_mps']:.2f} m/s, "
+            f"sideslip {turn['peak_sideslip_deg']:.0f}°, "
+            f"yaw rate {turn['peak_yaw_rate_degps']:.0f} °/s, "
+            f"{turn['heading_overshoot_deg']:.0f}° too far and back, "
+            f"out {turn['heading_error_deg']:+.1f}° off after {turn['duration_s']:.2f} s"
+        )
+    print(f"report: {folder / 'report.html'}")

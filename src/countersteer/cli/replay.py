@@ -1,0 +1,167 @@
+"""`replay`: commands in, motion out; or a log against the simulator."""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from countersteer.cli.options import DONE, Verbs, number, physics
+from countersteer.cli.record import record
+from countersteer.errors import InputError
+
+if TYPE_CHECKING:
+    from countersteer.car.car import Car
+
+
+LONGEST_REPLAY = 3600.0  # s
+INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
+
+
+def add(verbs: Verbs) -> None:
+    """The verb with its options."""
+    replay = verbs.verb("replay", "commands in, motion out; or a log against the simulator", run)
+    replay.add_argument(
+        "source", type=Path, metavar="COMMANDS_OR_RUN", help="a commands.csv, or a run's folder"
+    )
+    physics(replay, None)
+    replay.add_argument(
+        "--initial", default="", metavar="STATES", help='such as "vx_mps=2,yaw_rate_radps=1"'
+    )
+    replay.add_argument(
+        "--battery",
+        type=number(0, 1),
+        metavar="F",
+        help="charge, 0 to 1 (default: the run's battery_charge, or else 1; with --compare, "
+        "or else what agrees best)",
+    )
+    replay.add_argument("--compare", action="store_true", help="measured against simulated")
+    replay.add_argument(
+        "--horizon",
+        metavar="S|run",
+        help="seconds that are predicted at a time, or run: the whole of it (with --compare; "
+        "default 1.0)",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """`replay`."""
+    from countersteer.car.files import load_car
+    from countersteer.course.files import course_of_run
+    from countersteer.drivers.library import replay
+    from countersteer.estimation.dead_reckoning import DeadReckoning
+    from countersteer.evaluation.drive import about_run
+    from countersteer.pilot import Pilot
+    from countersteer.runs.files import read_commands
+    from countersteer.runs.run import read_run
+    from countersteer.simulator import Simulator
+    from countersteer.world.floor import floor_of_run
+
+    if options.horizon and not options.compare:
+        raise InputError("--horizon is of a comparison: give --compare as well")
+    if options.initial and options.compare:
+        raise InputError("--initial: --compare starts from what was measured")
+    run = read_run(options.source) if options.source.is_dir() else None
+    if run is None and not options.source.exists():
+        raise InputError(f"{options.source}: no such run folder or commands.csv")
+    if options.battery is not None and run is not None:
+        about = {**run.about, "battery_charge": options.battery}
+        run = dataclasses.replace(run, about=about)
+    if run is not None and options.car is None and run.car is not None and not options.set:
+        car, name = run.car, str(run.about.get("car_name", "its own car"))
+    else:
+        name = options.car or (str(run.about.get("car_name", "rx7")) if run else "rx7")
+        car = load_car(name, options.set)
+    if options.compare:
+        if run is None:
+            raise InputError("--compare needs a run folder, such as import makes")
+        return run_compare(options, run, car, name)
+    commands = run.commands if run else read_commands(options.source)
+    pose, velocity = read_initial(options.initial)
+    if run is not None and not options.initial:
+        begin = run.about.get("start") or run.about.get("course", {}).get("start")
+        if begin:
+            pose = (begin["x_m"], begin["y_m"], begin["heading_rad"])
+        first = run.about.get("initial", {})
+        velocity = (
+            first.get("vx_mps", 0.0),
+            first.get("vy_mps", 0.0),
+            first.get("yaw_rate_radps", 0.0),
+        )
+    charge = 1.0 if options.battery is None else options.battery
+    if run is not None:
+        charge = float(run.about.get("battery_charge", 1.0))
+    course = course_of_run(run.about) if run else None
+    # A driver that plays commands looks at no estimate.
+    estimator = DeadReckoning(start=pose, dt=options.dt)
+    pilot = Pilot.with_estimator(replay(commands), estimator, dt=options.dt)
+    simulator = Simulator.of(
+        course,
+        car,
+        dt=options.dt,
+        seed=options.seed,
+        start=pose,
+        velocity=velocity,
+        charge=charge,
+        floor=floor_of_run(run.about) if run else None,
+    )
+    times = commands["time_s"]
+    if times[-1] > LONGEST_REPLAY:
+        raise InputError(f"{options.source}: commands go on to {times[-1]:g} s, over an hour")
+    last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
+    longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
+    about = about_run(simulator, pilot, course, "replay", name, laps, car, {"kind": "replay"})
+    return record(options, simulator, pilot, course, about, longest, options.source.stem)
+
+
+def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:
+    """`replay --compare`."""
+    from countersteer.evaluation.compare import compare, draw_comparison
+    from countersteer.simulator import keep_programs
+
+    keep_programs()
+    horizon = None if options.horizon == "run" else read_horizon(options.horizon or "1.0")
+    result, series = compare(run, car, horizon, options.dt)
+    out = options.out or run.path
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "compare.json").write_text(json.dumps(result, indent=1) + "\n")
+    draw_comparison(series, out / "compare.png")
+    if options.json:
+        print(json.dumps(result))
+        return DONE
+    if not result["battery_told"]:
+        print(
+            f"battery: the log does not tell; {result['battery_charge']:.2f} of a full one agrees "
+            "best (--battery sets it)"
+        )
+    print(f"{name}: {result['windows']} windows of {result['horizon_s']:g} s; error at their ends:")
+    for quantity, error in result["median_abs_error"].items():
+        nothing = result["persistence"]["median_abs_error"][quantity]
+        print(f"  {quantity:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")
+    print(f"picture: {out / 'compare.png'}")
+    return DONE
+
+
+def read_initial(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Pose and velocity from `vx_mps=2,…`; what is not named is 0."""
+    values = dict.fromkeys(INITIAL, 0.0)
+    for part in filter(None, text.split(",")):
+        name, _, value = part.strip().partition("=")
+        if name not in values:
+            raise InputError(f"--initial: unknown state {name}; known: {', '.join(INITIAL)}")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise InputError(f"--initial: {name} must be a number, not {value!r}") from None
+        if not abs(values[name]) <= 1000:
+            raise InputError(f"--initial: {name} must be in [-1000, 1000]")
+    x, y, heading, vx, vy, yaw_rate = values.values()
+    return (x, y, heading), (vx, vy, yaw_rate)
+
+
+def read_horizon(text: str) -> float:
+    """The horizon of a comparison in seconds."""
+    try:
+        return float(number(0.05, 600)(text))
+    except argparse.ArgumentTypeError as error:
+        raise InputError(f"--horizon {error}, or the word run") from None

@@ -1,0 +1,132 @@
+"""`trials`: many drives, or commands for them."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from countersteer.cli.options import CHARGES, DONE, SPEEDS, Progress, Verbs, nominal_car, number
+
+
+def add(verbs: Verbs) -> None:
+    """The verb with its options."""
+    trials = verbs.group("trials", "many drives, or commands for them", "WHAT")
+    steps = trials(
+        "throttle-steps",
+        "commands: from rest, straight, each a second at one throttle, then none",
+        run_steps,
+    )
+    steps.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the files")
+    steps.add_argument(
+        "--levels", metavar="LIST", help="throttles, such as 0.2,0.5 (default ten, 0.1 to 1)"
+    )
+    steps.add_argument(
+        "--duration-s",
+        type=number(0.01, 60),
+        default=1.0,
+        metavar="S",
+        help="at each throttle (default 1)",
+    )
+    steps.add_argument(
+        "--rate-hz",
+        type=number(1, 1000),
+        default=100.0,
+        metavar="HZ",
+        help="rows a second (default 100)",
+    )
+    turns = trials(
+        "turns",
+        "turns in the open, stopped at different yaw rates: time and angle until stopped",
+        run_turns,
+    )
+    nominal_car(turns)
+    turns.add_argument(
+        "--cars", metavar="SET", help="draw each trial's car from this set (default the car itself)"
+    )
+    turns.add_argument(
+        "--trials", type=number(1, 10**6, int), default=1000, metavar="N", help="default 1000"
+    )
+    turns.add_argument(
+        "--speed-mps", type=SPEEDS, default=(1.0, 3.0), metavar="LO:HI", help="default 1:3"
+    )
+    turns.add_argument(
+        "--battery",
+        type=CHARGES,
+        default=None,
+        metavar="LO:HI",
+        help="charge, 0 to 1 (default the set's, or 0.3:1)",
+    )
+    turns.add_argument(
+        "--driver", default="drift-turn", metavar="POLICY", help="whose turns (default drift-turn)"
+    )
+    turns.add_argument("--seed", type=number(0, 2**31 - 1, int), default=0, help="default 0")
+    turns.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
+    turns.add_argument(
+        "--from",
+        dest="runs",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUN",
+        help="find the turns in these runs' folders instead, of a real car or a simulated one",
+    )
+
+
+def run_steps(options: argparse.Namespace) -> int:
+    """`trials`."""
+    from countersteer.evaluation.trials import LEVELS, read_levels, throttle_steps
+
+    levels = LEVELS if options.levels is None else read_levels(options.levels)
+    result = throttle_steps(options.out, levels, options.duration_s, options.rate_hz)
+    if options.json:
+        print(json.dumps(result))
+    else:
+        print((options.out / "README.txt").read_text(), end="")
+    return DONE
+
+
+def run_turns(options: argparse.Namespace) -> int:
+    """`trials turns`."""
+    from countersteer.car.files import load_car
+    from countersteer.drivers.policy import load_policy
+    from countersteer.evaluation import open_turns
+    from countersteer.evaluation.population import load_population
+    from countersteer.runs.recorder import new_folder
+    from countersteer.simulator import keep_programs
+
+    if options.runs:
+        rows = [row for path in options.runs for row in open_turns.of_run(path)]
+        tried, title = None, ", ".join(path.name for path in options.runs[:2])
+        title += f" and {len(options.runs) - 2} more" if len(options.runs) > 2 else ""
+        folder = new_folder(options.out, "turns")
+    else:
+        keep_programs(cores=os.cpu_count() or 1)
+        car, turning = load_car(options.car, options.set), load_policy(options.driver).turning
+        cars = load_population(options.cars) if options.cars else None
+        charge = options.battery or (None if cars else (0.3, 1.0))
+        seeds = range(options.seed, options.seed + options.trials)
+        folder = new_folder(options.out, "turns")
+        with Progress(options.json) as progress:
+            rows = open_turns.trial(
+                car, turning, cars, seeds, options.speed_mps, charge, progress.show
+            )
+        tried, title = options.trials, f"{options.car}, {options.trials} turns"
+    table = open_turns.as_table(rows)
+    open_turns.write_rows(folder / "turns.csv", rows)
+    open_turns.draw_turns(table, folder / "turns.png", title)
+    result: dict[str, Any] = (
+        {"car": options.car} if tried else {"runs": [str(path) for path in options.runs]}
+    )
+    result |= open_turns.summary(table, tried)
+    (folder / "turns.json").write_text(json.dumps(result, indent=1) + "\n")
+    if options.json:
+        print(json.dumps(result | {"out": str(folder)}))
+        return DONE
+    print(f"{len(rows)} turns that were stopped; low, median, high:")
+    for name in open_turns.COLUMNS[1:7]:
+        ends = result[name]
+        if ends:
+            print(f"  {name:20}" + "".join(f"{ends[k]:10.2f}" for k in ("low", "median", "high")))
+    print(f"table: {folder / 'turns.csv'}; picture: {folder / 'turns.png'}")
+    return DONE

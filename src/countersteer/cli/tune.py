@@ -1,0 +1,191 @@
+"""`tune`: logs of a car to the car's numbers."""
+
+import argparse
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from countersteer.cli.options import DONE, Verbs, number
+from countersteer.errors import InputError
+
+if TYPE_CHECKING:
+    from countersteer.car.car import Car
+
+
+def add(verbs: Verbs) -> None:
+    """The verb with its options."""
+    tune = verbs.verb("tune", "logs of a car to the car's numbers", run)
+    tune.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run's folder")
+    tune.add_argument(
+        "--car",
+        default="rx7",
+        metavar="BASE",
+        help="where the fit begins, and what is not fitted: library name or .toml (default rx7)",
+    )
+    tune.add_argument(
+        "--fit",
+        default="all",
+        choices=("acceleration", "longitudinal", "steering", "handling", "drift", "all"),
+        help="acceleration: the motor's strength from steps of throttle; longitudinal: motor, "
+        "battery, rolling, braking; steering: servo and its map; handling: yaw inertia and grip; "
+        "drift: combined slip past the limit; all: these in turn, then everything at once "
+        "(default all)",
+    )
+    tune.add_argument(
+        "--out", type=Path, required=True, metavar="CAR.toml", help="where the car is written"
+    )
+    tune.add_argument(
+        "--validate", nargs="+", type=Path, default=[], metavar="RUN", help="judge on these runs"
+    )
+    tune.add_argument(
+        "--new",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUN",
+        help="runs since BASE was fitted to the others: fit to all, and say by how much BASE errs "
+        "more on these, and whether the driver should be learned again",
+    )
+    tune.add_argument(
+        "--hold-out",
+        type=number(0, 1, int),
+        default=None,
+        metavar="0|1",
+        help="1: keep every third block of 2 s of each run back and judge on it (default 1 "
+        "without --validate)",
+    )
+    tune.add_argument(
+        "--source",
+        choices=("encoder", "sonar", "lines"),
+        default="encoder",
+        help="with --fit acceleration: what tells the speed (default encoder)",
+    )
+    tune.add_argument(
+        "--precision",
+        type=number(1e-9, 1),
+        default=1e-3,
+        metavar="PART",
+        help="with --fit acceleration: done when it changes by less (default 0.001)",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """`tune`."""
+    from countersteer.car.files import load_car
+    from countersteer.runs.run import read_run
+    from countersteer.simulator import keep_programs
+    from countersteer.tuning.tune import other_floors
+
+    if options.out.suffix != ".toml":
+        raise InputError(f"--out {options.out}: name a .toml file")
+    try:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {options.out}: {error.strerror}") from None
+    keep_programs(blocks=True)
+    runs = [read_run(path) for path in options.runs]
+    car, base = load_car(options.car), Path(options.car).stem
+    if options.fit == "acceleration":
+        if options.new:
+            raise InputError("--new: --fit acceleration does not judge new runs")
+        return tune_acceleration(options, runs, car)
+    validation = [read_run(path) for path in options.validate]
+    new = [read_run(path) for path in options.new]
+    named = {str(run.about.get("car_name", base)) for run in (*runs, *validation, *new)}
+    others = other_floors(options.car, named - {base})
+    return tune_all(options, runs, validation, new, base, car, others)
+
+
+def tune_all(
+    options: argparse.Namespace,
+    runs: list[Any],
+    validation: list[Any],
+    new: list[Any],
+    base: str,
+    car: "Car",
+    others: dict[str, "Car"],
+) -> int:
+    """A fit to windows of logs: cars by surface, a page beside them."""
+    import jax
+
+    from countersteer.tuning import relearn, tune
+    from countersteer.tuning.advice import next_log
+    from countersteer.viewing.tuning_page import write_tuning_page
+
+    with jax.enable_x64(True):
+        cars = tune.by_surface(base, car, others)
+        logs = old = tune.read_logs(runs, cars, tune.EVERY["judged"], base)
+        if new:
+            since = tune.read_logs(new, cars, tune.EVERY["judged"], base)
+            logs = old.joined(since)
+        judged = (
+            tune.read_logs(validation, cars, tune.EVERY["judged"], base) if validation else None
+        )
+        hold_out = not validation if options.hold_out is None else bool(options.hold_out)
+        say = (lambda _: None) if options.json else (lambda text: print(f"  {text}", flush=True))
+        result, about, parts = tune.tune(logs, cars, options.fit, hold_out, judged, say)
+        about |= {
+            "car": options.car,
+            "commands": shlex.join(["countersteer", *sys.argv[1:]]),
+            "residuals": tune.residuals(result.cars, parts[0][1]),
+            "next_log": next_log(about["parameters"]),
+        }
+        if new:
+            about["new_runs"] = relearn.judge(
+                cars, result.cars, old, since, options.fit, hold_out, say
+            )
+        drawn = tune.series(result.cars, parts)
+    files = tune.write_cars(result, about, options.out)
+    page = options.out.with_suffix(".html")
+    write_tuning_page(page, about, drawn)
+    short = {key: value for key, value in about.items() if key != "residuals"}
+    short["cars"] = {name: str(path) for name, path in files.items()}
+    options.out.with_suffix(".json").write_text(json.dumps(short, indent=1) + "\n")
+    if options.json:
+        print(json.dumps(short | {"page": str(page)}))
+        return DONE
+    for line in tune.table_lines(about):
+        print(line)
+    if new:
+        print(about["new_runs"]["said"])
+    print(f"cars: {', '.join(map(str, files.values()))}; page: {page}")
+    return DONE
+
+
+def tune_acceleration(options: argparse.Namespace, runs: list[Any], car: "Car") -> int:
+    """The paper's adjuster: one parameter from steps of throttle."""
+    from countersteer.car.files import save_car
+    from countersteer.tuning.acceleration import draw_acceleration, fit_acceleration
+
+    found = fit_acceleration(runs, car, options.source, options.precision)
+    about: dict[str, Any] = {
+        "parameter": found.parameter,
+        "before": found.before,
+        "value": found.after,
+        "deviation": found.deviation,
+        "rms_before_mps": found.rms_before,
+        "rms_mps": found.rms_after,
+        "iterations": found.iterations,
+        "levels": [round(series.level, 3) for series in found.series],
+        "not_used": {one.path.name: one.reason for one in found.unused},
+        "masked": list(found.masked),
+    }
+    save_car(found.car, options.out, {"acceleration": json.dumps(about)})
+    picture = options.out.with_suffix(".png")
+    draw_acceleration(found, picture)
+    if options.json:
+        print(json.dumps(about | {"car": str(options.out), "picture": str(picture)}))
+        return DONE
+    print(
+        f"{found.parameter}: {found.before:.4g} -> {found.after:.4g} ± {found.deviation:.2g}; "
+        f"speed off by {found.rms_before:.3f} m/s before, {found.rms_after:.3f} after, over "
+        f"{len(found.series)} levels in {found.iterations} steps"
+    )
+    for name, reason in about["not_used"].items():
+        print(f"  not used: {name}: {reason}")
+    for line in found.masked:
+        print(f"  masked: {line}")
+    print(f"car: {options.out}; picture: {picture}")
+    return DONE
