@@ -19,15 +19,15 @@ check: $(READY)
 	$(BIN)/mypy
 
 accuracy: $(READY)
-	$(BIN)/python -m countersteer.evaluation.accuracy docs/accuracy.md
+	$(BIN)/python -m countersteer.bench.accuracy docs/accuracy.md
 
 # Twenty fits: six minutes or more on two cores.
 recovery: $(READY)
-	$(BIN)/python -m countersteer.evaluation.recovery docs/recovery.md
+	$(BIN)/python -m studies.recovery docs/recovery.md
 
 # Some twenty programs to compile, then 256 cars in each: ten minutes or more on two cores.
 estimation: $(READY)
-	$(BIN)/python -m countersteer.evaluation.estimation_study docs/estimation.md
+	$(BIN)/python -m studies.estimation docs/estimation.md
 
 bench: $(READY)
 	$(BIN)/countersteer bench --out docs/speed.md

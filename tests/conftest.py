@@ -13,10 +13,10 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import changed
 from countersteer.course.course import Course
 from countersteer.drivers.replay import Replay
-from countersteer.evaluation.drive import about_run
-from countersteer.evaluation.drive import drive as write_drive
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
+from countersteer.recording import about_run
+from countersteer.recording import drive as write_drive
 from countersteer.runs.run import Run, read_run
 from countersteer.signals import Motion
 from countersteer.simulator import Record, Simulator, keep_programs

@@ -11,8 +11,8 @@ from conftest import step_run
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.errors import InputError
-from countersteer.runs.dart import import_dart
 from countersteer.runs.files import Table
+from countersteer.runs.importers.dart import import_dart
 from countersteer.runs.run import Run, read_run
 from countersteer.tuning.acceleration import (
     NEVER_MOVES,

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from countersteer.batch.population import draw, load_population
+from countersteer.batch.rollout import watched
 from countersteer.car.files import load_car
 from countersteer.course.course import from_segments
 from countersteer.course.files import load_course
@@ -15,14 +17,12 @@ from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.straighten import lane
 from countersteer.estimation import lidar_walls
 from countersteer.estimation.kalman import diagonal
-from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.rollout import watched
-from countersteer.evaluation.watches import Errors
 from countersteer.pilot import Pilot
 from countersteer.sensing import lidar
 from countersteer.simulator import Simulator, scan
 from countersteer.task.task import Outcome
 from countersteer.world.walls import padded
+from studies.watches import Errors
 
 WIDTH = 1.4
 SCANNER = load_car("rx7", ("sensors.lidar.beams=72",)).sensors.lidar

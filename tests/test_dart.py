@@ -8,12 +8,12 @@ import pytest
 
 from countersteer.car.files import load_car
 from countersteer.errors import InputError
-from countersteer.evaluation.compare import Compared, compare, draw_comparison, sensed, slides
-from countersteer.runs.dart import POINT_X, POINT_Y, import_dart
 from countersteer.runs.files import Table, TableWriter, command_rows, write_table
+from countersteer.runs.importers.dart import POINT_X, POINT_Y, import_dart
 from countersteer.runs.run import Run, read_run
 from countersteer.signals import TRUTH
 from countersteer.tuning import windows
+from countersteer.tuning.compare import Compared, compare, draw_comparison, sensed, slides
 from countersteer.tuning.windows import (
     ENCODER_QUANTUM,
     GYRO_LAG,

@@ -8,9 +8,9 @@ import pytest
 from countersteer import cli
 from countersteer.car.files import load_car
 from countersteer.errors import InputError
-from countersteer.evaluation.compare import compare
-from countersteer.runs.eth import PERIOD, import_eth
+from countersteer.runs.importers.eth import PERIOD, import_eth
 from countersteer.runs.run import Run, read_run
+from countersteer.tuning.compare import compare
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "eth_rccar"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the ETH logs are not here")

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from conftest import driven, judged
+from countersteer.batch import rollout
+from countersteer.batch.evaluate import interval
+from countersteer.batch.population import draw, load_population
 from countersteer.car.files import load_car
 from countersteer.cli import main
 from countersteer.course.along import line_of
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.errors import InputError
-from countersteer.evaluation import rollout
-from countersteer.evaluation.evaluate import interval
-from countersteer.evaluation.population import draw, load_population
 from countersteer.pilot import Pilot
 
 SEEDS = range(400)

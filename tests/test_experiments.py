@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from countersteer import cli
+from countersteer import cli, experiments
 from countersteer.car.files import load_car
 from countersteer.drivers.drift_turn import SPIN, STRAIGHT
 from countersteer.drivers.driver import Status
-from countersteer.evaluation import experiments
-from countersteer.evaluation.experiments import (
+from countersteer.experiments import (
     battery,
     control_rate,
     drift_threshold,
@@ -22,8 +21,8 @@ from countersteer.evaluation.experiments import (
     stop_time,
     turn_rate,
 )
-from countersteer.evaluation.experiments.found import write
-from countersteer.evaluation.open_turns import Series
+from countersteer.experiments.found import write
+from countersteer.experiments.open_turns import Series
 from countersteer.runs.run import read_run
 from countersteer.signals import Command
 from test_open_turns import LANES, TIME, slowing, write_run

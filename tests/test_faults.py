@@ -10,10 +10,10 @@ import pytest
 
 from countersteer import cli
 from countersteer.errors import InputError
-from countersteer.runs.dart import import_dart
-from countersteer.runs.eth import import_eth
-from countersteer.runs.faults import faults, refuse, repaired
+from countersteer.runs.defects import faults, refuse, repaired
 from countersteer.runs.files import Table
+from countersteer.runs.importers.dart import import_dart
+from countersteer.runs.importers.eth import import_eth
 from countersteer.runs.run import Run, read_run
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -24,14 +24,26 @@ MAY_IMPORT = {
     "task": {"car", "course"},
     "runs": {"car", "course"},
     "tuning": {"car", "world", "sensing", "runs"},
-    "evaluation": {
-        "car", "course", "world", "sensing", "link", "pilot", "simulator", "task", "runs",
-        "tuning", "estimation",
-        "drivers",  # the bench times a drive, so it needs one that drives
+    "recording": {  # a drive into a run's folder
+        "car", "course", "world", "sensing", "pilot", "simulator", "task", "runs",
+    },
+    "verdict": {"course", "task", "runs", "tuning"},  # the judge of a folder
+    "batch": {
+        "car", "course", "world", "sensing", "link", "pilot", "simulator", "task",
+        "estimation", "drivers",  # what open drives are told of the truth
     },
     "learning": {
-        "car", "course", "pilot", "simulator", "task", "runs", "evaluation",
+        "car", "course", "pilot", "task", "runs", "batch",
         "drivers",  # what is learned is a driver's numbers
+        "experiments",  # from which it learns
+    },
+    "experiments": {
+        "car", "course", "world", "link", "estimation", "pilot", "simulator", "task", "runs",
+        "batch", "tuning", "drivers",
+    },
+    "bench": {
+        "car", "course", "world", "pilot", "simulator", "batch",
+        "drivers",  # it times a drive, so it needs one that drives
     },
     "viewing": {"car", "runs", "task", "world"},  # a car is drawn to its size, with its forces
     "listing": {"car", "course"},

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.cli import main
 from countersteer.course.files import load_course
 from countersteer.drivers import policy
 from countersteer.drivers.policy import load_policy
-from countersteer.evaluation.population import load_population
 from countersteer.learning import turning
 from countersteer.task.task import Outcome, Score
 from countersteer.task.turns import Turns

@@ -12,8 +12,8 @@ from countersteer.car.files import load_car
 from countersteer.drivers.policy import load_policy
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
-from countersteer.evaluation.local_regression import fit, predicted
-from countersteer.evaluation.open_turns import (
+from countersteer.experiments.local_regression import fit, predicted
+from countersteer.experiments.open_turns import (
     Series,
     as_table,
     of_run,
@@ -22,7 +22,7 @@ from countersteer.evaluation.open_turns import (
     trial,
     write_rows,
 )
-from countersteer.evaluation.stop_regression import regress_stops
+from countersteer.experiments.stop_regression import regress_stops
 
 # Numbers of its own: the library's may change.
 TURNING = Turning(

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from countersteer.car.files import load_car
-from countersteer.evaluation import recovery
-from countersteer.evaluation.recovery import Case
 from countersteer.tuning import fit
+from studies import recovery
+from studies.recovery import Case
 
 
 @pytest.mark.parametrize(("seed", "what"), [(0, "handling"), (1, "all")])

@@ -7,10 +7,10 @@ import numpy as np
 
 from conftest import driven
 from countersteer import streams
+from countersteer.batch.population import draw, load_population
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
-from countersteer.evaluation.population import draw, load_population
 from countersteer.streams import Stream
 
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from conftest import driven, judged, write_run
+from countersteer.batch.population import draw, load_population
 from countersteer.car.files import load_car
 from countersteer.course.course import Course, Turn, from_segments
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.replay import Replay
-from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.verdict import judge_run, samples_of
-from countersteer.runs.dart import import_dart
+from countersteer.runs.importers.dart import import_dart
 from countersteer.runs.run import read_run
 from countersteer.signals import Motion, Wheels
 from countersteer.task import turns
 from countersteer.task.task import Outcome, Sample, Task, summary
+from countersteer.verdict import judge_run, samples_of
 
 CAR = load_car("rx7")
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dart"

@@ -7,7 +7,7 @@ import pytest
 
 from countersteer import cli
 from countersteer.errors import InputError
-from countersteer.evaluation.trials import LEVELS, read_levels, throttle_steps
+from countersteer.experiments.throttle_steps import LEVELS, read_levels, throttle_steps
 from countersteer.runs.files import read_commands
 from countersteer.runs.run import read_run
 

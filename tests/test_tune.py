@@ -14,13 +14,13 @@ from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
 from countersteer.cli import main
 from countersteer.errors import InputError
-from countersteer.evaluation import folds
-from countersteer.evaluation.compare import compare
 from countersteer.runs.files import COMMANDS, TableWriter, command_rows
 from countersteer.runs.run import Run, read_run
 from countersteer.tuning import fit, tune
+from countersteer.tuning.compare import compare
 from countersteer.tuning.shooting import Shots
 from countersteer.world import plant
+from studies import folds
 
 TRUE = {
     "tires.front.friction": 0.45,

@@ -17,7 +17,7 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`bench`."""
-    from countersteer.evaluation import bench
+    from countersteer.bench import bench
 
     if options.out and (options.out.suffix != ".md" or not options.out.parent.is_dir()):
         raise InputError(f"{options.out}: name a file .md in a folder that is there")

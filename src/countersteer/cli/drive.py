@@ -69,9 +69,9 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.drivers.library import make_driver
-    from countersteer.evaluation.drive import about_run
     from countersteer.link.link import LINKS
     from countersteer.pilot import Pilot
+    from countersteer.recording import about_run
     from countersteer.runs.files import read_commands
     from countersteer.sensing.faults import read_fault
     from countersteer.simulator import Simulator
@@ -118,7 +118,7 @@ def drawn_alone(options: argparse.Namespace, course: "Course", car: "Car") -> tu
     import jax
     import numpy as np
 
-    from countersteer.evaluation.population import draw, load_population
+    from countersteer.batch.population import draw, load_population
 
     drawn = draw(
         load_population(options.cars), car, course, [options.seed], np.float32, options.speed_mps

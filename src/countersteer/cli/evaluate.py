@@ -53,11 +53,11 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`evaluate`."""
+    from countersteer.batch import evaluate
+    from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.drivers.library import make_driver
-    from countersteer.evaluation import evaluate
-    from countersteer.evaluation.population import load_population
     from countersteer.link.link import LINKS
     from countersteer.runs.files import read_commands
     from countersteer.runs.recorder import new_folder

@@ -35,9 +35,9 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`experiment`."""
+    from countersteer import experiments
     from countersteer.car.files import load_car
-    from countersteer.evaluation import experiments
-    from countersteer.evaluation.experiments.found import write
+    from countersteer.experiments.found import write
     from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
     from countersteer.simulator import keep_programs

@@ -19,8 +19,8 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`import`."""
-    from countersteer.runs.dart import import_dart
-    from countersteer.runs.eth import import_eth
+    from countersteer.runs.importers.dart import import_dart
+    from countersteer.runs.importers.eth import import_eth
 
     importer = {"dart": import_dart, "eth": import_eth}[options.format]
     results = []

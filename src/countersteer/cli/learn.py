@@ -78,7 +78,7 @@ def add(verbs: Verbs) -> None:
 
 def run_stop_angle(options: argparse.Namespace) -> int:
     """`learn stop-angle`."""
-    from countersteer.evaluation import stop_regression
+    from countersteer.experiments import stop_regression
     from countersteer.learning.stop_angle import learn
 
     if options.out.suffix != ".toml":
@@ -98,10 +98,10 @@ def run_stop_angle(options: argparse.Namespace) -> int:
 
 def run_turn(options: argparse.Namespace) -> int:
     """`learn turn`."""
+    from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import load_policy, save_policy
-    from countersteer.evaluation.population import load_population
     from countersteer.learning.turning import Generation, search
     from countersteer.simulator import keep_programs
 

@@ -24,7 +24,7 @@ def record(
     place: str,
 ) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
-    from countersteer.evaluation.drive import drive
+    from countersteer.recording import drive
     from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
     from countersteer.simulator import keep_programs

@@ -50,8 +50,8 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.course.files import course_of_run
     from countersteer.drivers.library import replay
     from countersteer.estimation.dead_reckoning import DeadReckoning
-    from countersteer.evaluation.drive import about_run
     from countersteer.pilot import Pilot
+    from countersteer.recording import about_run
     from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator
@@ -116,8 +116,8 @@ def run(options: argparse.Namespace) -> int:
 
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:
     """`replay --compare`."""
-    from countersteer.evaluation.compare import compare, draw_comparison
     from countersteer.simulator import keep_programs
+    from countersteer.tuning.compare import compare, draw_comparison
 
     keep_programs()
     horizon = None if options.horizon == "run" else read_horizon(options.horizon or "1.0")

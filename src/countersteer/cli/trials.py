@@ -75,7 +75,7 @@ def add(verbs: Verbs) -> None:
 
 def run_steps(options: argparse.Namespace) -> int:
     """`trials`."""
-    from countersteer.evaluation.trials import LEVELS, read_levels, throttle_steps
+    from countersteer.experiments.throttle_steps import LEVELS, read_levels, throttle_steps
 
     levels = LEVELS if options.levels is None else read_levels(options.levels)
     result = throttle_steps(options.out, levels, options.duration_s, options.rate_hz)
@@ -88,10 +88,10 @@ def run_steps(options: argparse.Namespace) -> int:
 
 def run_turns(options: argparse.Namespace) -> int:
     """`trials turns`."""
+    from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
     from countersteer.drivers.policy import load_policy
-    from countersteer.evaluation import open_turns
-    from countersteer.evaluation.population import load_population
+    from countersteer.experiments import open_turns
     from countersteer.runs.recorder import new_folder
     from countersteer.simulator import keep_programs
 

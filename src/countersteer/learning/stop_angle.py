@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from countersteer.drivers.policy import save_policy
-from countersteer.evaluation.open_turns import read_turns
-from countersteer.evaluation.stop_regression import Stops, about, regress_stops
+from countersteer.experiments.open_turns import read_turns
+from countersteer.experiments.stop_regression import Stops, about, regress_stops
 from countersteer.runs.files import Table
 
 

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from countersteer.batch.population import Population, draw
+from countersteer.batch.rollout import rollouts
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.policy import TABLES, Policy
-from countersteer.evaluation.population import Population, draw
-from countersteer.evaluation.rollout import rollouts
 from countersteer.pilot import Pilot
 from countersteer.task.task import Outcome, Score
 

@@ -32,7 +32,7 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed, declarations
 from countersteer.errors import InputError
-from countersteer.runs import faults
+from countersteer.runs import defects as faults
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 from countersteer.sensing import parts

@@ -28,7 +28,7 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.car.parameter import Declaration, changed, declarations
 from countersteer.errors import InputError
-from countersteer.runs.faults import Fault
+from countersteer.runs.defects import Fault
 from countersteer.runs.run import Run
 from countersteer.signals import Array
 from countersteer.tuning import shooting

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from countersteer.errors import InputError
-from countersteer.runs.faults import readings
+from countersteer.runs.defects import readings
 from countersteer.runs.run import Run
 
 # A count over a window begins and ends somewhere between two edges: it is off by the difference of

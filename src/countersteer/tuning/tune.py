@@ -12,7 +12,7 @@ from countersteer.car.car import Car
 from countersteer.car.files import library, load_car, save_car
 from countersteer.car.parameter import EDGE, changed
 from countersteer.errors import InputError
-from countersteer.runs.faults import Fault, faults, refuse, repaired
+from countersteer.runs.defects import Fault, faults, refuse, repaired
 from countersteer.runs.run import Run
 from countersteer.tuning import fit, shooting
 from countersteer.tuning.fit import FLOOR, Fitted, Result

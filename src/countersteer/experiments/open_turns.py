@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from countersteer.batch.open_drives import batch, drives
+from countersteer.batch.population import Population, draw
 from countersteer.car.car import Car
 from countersteer.drivers.open_turn import open_turn
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
-from countersteer.evaluation.open_drives import batch, drives
-from countersteer.evaluation.population import Population, draw
 from countersteer.runs.files import Table, read_table
 from countersteer.runs.run import Run, drawn_car, read_run
 from countersteer.task.turns import sideslip

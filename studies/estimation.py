@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
+from countersteer.batch.evaluate import Trials, interval, results
+from countersteer.batch.population import Drawn, draw, load_population
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.course.course import Course
@@ -26,15 +28,13 @@ from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.straighten import lane, straighten
 from countersteer.estimation.pose import PoseFilter
-from countersteer.evaluation.evaluate import Trials, interval, results
-from countersteer.evaluation.population import Drawn, draw, load_population
-from countersteer.evaluation.watches import FIT, PARTICLES, SAMPLE, Errors, Places, anywhere
 from countersteer.link.link import ONBOARD
 from countersteer.sensing.faults import KINDS, Fault
 from countersteer.simulator import keep_programs
 from countersteer.task.task import PERIOD, Outcome, Score
 from countersteer.world import battery
 from countersteer.world.walls import padded
+from studies.watches import FIT, PARTICLES, SAMPLE, Errors, Places, anywhere
 
 SET, SPEEDS, COURSES = "around", (1.5, 3.0), ("box", "ess")
 CARS = 256  # of each course

@@ -1,4 +1,4 @@
-"""Error of the position against the step: `python -m countersteer.evaluation.accuracy PAGE`."""
+"""Error of the position against the step: `python -m countersteer.bench.accuracy PAGE`."""
 
 import sys
 from pathlib import Path

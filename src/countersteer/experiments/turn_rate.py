@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from countersteer.batch.open_drives import batch, commands, drives
+from countersteer.batch.rollout import LANES
 from countersteer.car.car import Car
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.errors import InputError
-from countersteer.evaluation.experiments.found import Found, Report, silent
-from countersteer.evaluation.open_drives import batch, commands, drives
-from countersteer.evaluation.open_turns import series_of
-from countersteer.evaluation.rollout import LANES
+from countersteer.experiments.found import Found, Report, silent
+from countersteer.experiments.open_turns import series_of
 from countersteer.runs.run import Run, drawn_car
 
 SPEEDS = (0.5, 0.8, 1.1)  # m/s

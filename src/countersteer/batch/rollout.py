@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from countersteer.batch.population import Drawn
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
-from countersteer.evaluation.population import Drawn
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Memory, Pilot
 from countersteer.sensing import suite

@@ -4,12 +4,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from countersteer.batch.rollout import LANES
 from countersteer.car.car import Car
 from countersteer.drivers.policy import library
-from countersteer.evaluation import stop_regression
-from countersteer.evaluation.experiments.found import Found, Report, silent
-from countersteer.evaluation.open_turns import as_table, of_run, trial
-from countersteer.evaluation.rollout import LANES
+from countersteer.experiments import stop_regression
+from countersteer.experiments.found import Found, Report, silent
+from countersteer.experiments.open_turns import as_table, of_run, trial
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 

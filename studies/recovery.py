@@ -1,4 +1,4 @@
-"""Known cars found again from their logs: `python -m countersteer.evaluation.recovery PAGE`.
+"""Known cars found again from their logs: `python -m studies.recovery PAGE`.
 
 What a fit says of its deviations is put to the test where the truth is known. Each of some cars
 differs from a base in every parameter that is fitted, at random. It drives three short logs of
@@ -21,8 +21,8 @@ from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
 from countersteer.drivers.replay import Replay
-from countersteer.evaluation.drive import about_run, drive
 from countersteer.pilot import Pilot
+from countersteer.recording import about_run, drive
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run, read_run
 from countersteer.simulator import Simulator, keep_programs

@@ -65,26 +65,26 @@ def rate(work: float, run: Callable[[], Any], least: float) -> float:
 
 def planar_side(size: Size) -> Iterator[dict[str, Any]]:
     """The planar world in 32 bits, rx7 on box with walls and all stages."""
-    from countersteer.evaluation import batch
-    from countersteer.evaluation.profile import profile
+    from countersteer.batch import blocks
+    from countersteer.bench.profile import profile
 
     count = cores()
     runs: dict[str, tuple[float, Callable[[], Any]]] = {}
     problem = Fleet(size.cars, count)
-    program = problem.compiled(whole := batch.in_blocks(DT, size.ticks))
+    program = problem.compiled(whole := blocks.in_blocks(DT, size.ticks))
     work = float(problem.cars * size.ticks)
     runs["planar_batch_steps_per_s"] = (work, problem.call(program))
-    facts: dict[str, Any] = {"profile": profile(program.as_text(), batch.LANES)}
+    facts: dict[str, Any] = {"profile": profile(program.as_text(), blocks.LANES)}
     facts |= {"ends": problem.manoeuvres(program, size.ticks)}
     if size.variants:
         varied = Fleet(size.cars, count, varied=True)
         runs["planar_varied_steps_per_s"] = (work, varied.call(varied.compiled(whole)))
         large = Fleet(size.cars, count, dt=LARGE_DT)
-        at_large = large.compiled(batch.in_blocks(LARGE_DT, size.ticks))
+        at_large = large.compiled(blocks.in_blocks(LARGE_DT, size.ticks))
         runs["planar_large_step_steps_per_s"] = (work, large.call(at_large))
         facts |= {"ends_large": large.manoeuvres(at_large, size.ticks)}
         alone = Fleet(size.cars, 1)
-        one_core = alone.compiled(batch.in_blocks(DT, size.ticks, cores=1))
+        one_core = alone.compiled(blocks.in_blocks(DT, size.ticks, cores=1))
         runs["planar_one_core_steps_per_s"] = (
             float(alone.cars * size.ticks),
             alone.call(one_core),
@@ -92,12 +92,12 @@ def planar_side(size: Size) -> Iterator[dict[str, Any]]:
     for lanes in size.growth:
         if lanes == size.cars:
             continue
-        spread = lanes >= batch.LANES * count
+        spread = lanes >= blocks.LANES * count
         fleet = Fleet(lanes, count) if spread else Fleet(lanes, 1, block=lanes)
-        blocks = batch.in_blocks(
-            DT, size.ticks, batch.LANES if spread else lanes, count if spread else 1
+        stepped = blocks.in_blocks(
+            DT, size.ticks, blocks.LANES if spread else lanes, count if spread else 1
         )
-        run = fleet.call(fleet.compiled(blocks))
+        run = fleet.call(fleet.compiled(stepped))
         runs[f"lanes_{lanes}"] = (float(lanes * size.ticks), run)
     yield facts
     while True:
@@ -119,15 +119,15 @@ class Fleet:
         import jax
         import jax.numpy as jnp
 
+        from countersteer.batch import blocks
         from countersteer.car.files import load_car
         from countersteer.course.files import load_course
-        from countersteer.evaluation import batch
         from countersteer.signals import Wheels
         from countersteer.world import planar
         from countersteer.world.walls import padded
 
         self.dt = dt
-        self.cars = cars = batch.spread(cars, block or batch.LANES, cores)
+        self.cars = cars = blocks.spread(cars, block or blocks.LANES, cores)
         rng = np.random.default_rng(0)
         course, car = load_course("box"), load_car("rx7")
         car = jax.tree.map(np.float32, car)
@@ -174,7 +174,7 @@ class Fleet:
         """Where (x and y, m) the lanes are at the end of the manoeuvres of docs/accuracy.md."""
         import jax
 
-        from countersteer.evaluation.accuracy import DURATION, MANOEUVRES
+        from countersteer.bench.accuracy import DURATION, MANOEUVRES
         from countersteer.world import planar
 
         begins = [planar.initial_state(self.car, self.dt, velocity=m.velocity) for m in MANOEUVRES]
@@ -193,12 +193,13 @@ def plain_side(size: Size) -> Iterator[dict[str, Any]]:
     """The same batch by `vmap` alone, and the converged manoeuvres in 64 bits."""
     import jax
 
+    from countersteer.batch import blocks
+    from countersteer.bench import accuracy
     from countersteer.car.files import load_car
-    from countersteer.evaluation import accuracy, batch
 
     fleet = Fleet(min(size.cars, 2048), 1)
     ticks = min(size.ticks, 20)
-    program = fleet.compiled(jax.jit(partial(batch.advance, dt=DT, ticks=ticks)))
+    program = fleet.compiled(jax.jit(partial(blocks.advance, dt=DT, ticks=ticks)))
     yield {"converged": accuracy.positions(load_car("rx7"), accuracy.FINEST)[:, :2].tolist()}
     while True:
         work = float(fleet.cars * ticks)
@@ -207,9 +208,9 @@ def plain_side(size: Size) -> Iterator[dict[str, Any]]:
 
 def mujoco_side(size: Size) -> Iterator[dict[str, Any]]:
     """A like car in MuJoCo, on all cores and on one."""
+    from countersteer.bench.mujoco_car import batch, model
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
-    from countersteer.evaluation.mujoco_car import batch, model
 
     compiled = model(load_car("rx7"), load_course("box"), DT)
     cars, steps = 64, 200
@@ -264,7 +265,7 @@ def thinking(simulator: Any, pilot: Any) -> tuple[Any, Any, Any]:
 
 def native_side(size: Size) -> Iterator[dict[str, Any]]:
     """The same equations as C, compiled for this machine's vectors; and the machine's peak."""
-    from countersteer.evaluation.native import Native
+    from countersteer.bench.native import Native
 
     native = Native(Fleet(size.cars, 1), cores())
     work = float(native.cars * size.ticks)
@@ -292,7 +293,7 @@ def serve(side: str, size: Size) -> None:
     from countersteer.simulator import keep_programs
 
     if side == "planar":
-        from countersteer.evaluation.batch import flags
+        from countersteer.batch.blocks import flags
 
         os.environ["XLA_FLAGS"] = flags(cores())
     keep_programs(batches=side != "drive")
@@ -309,7 +310,7 @@ class Side:
         """Starts the process."""
         self.name = name
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # as long as the process
-        order = f"from countersteer.evaluation import bench; bench.serve({name!r}, bench.{size!r})"
+        order = f"from countersteer.bench import bench; bench.serve({name!r}, bench.{size!r})"
         environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
         self._process = subprocess.Popen(
             [sys.executable, "-c", order],
@@ -557,7 +558,7 @@ def page(found: dict[str, Any], picture: str) -> str:
     text += [
         "The planar batch is `rx7` on `box`, with walls and all stages, in 32 bits, at a step of",
         "1 ms; each lane has its own state and commands. MuJoCo steps a chassis with four wheels",
-        "between the same walls at 1 ms (`evaluation/mujoco_car.py`), by its own threads.",
+        "between the same walls at 1 ms (`bench/mujoco_car.py`), by its own threads.",
     ]
     if found.get("planar_over_mujoco"):
         text.append(f"**The planar batch is {found['planar_over_mujoco']:.0f} times MuJoCo.**")

@@ -1,6 +1,6 @@
 """Every window of some logs predicted by a car that was not fitted to it.
 
-`python -m countersteer.evaluation.folds PAGE BASE RUN...` fits three times, from BASE (and the cars
+`python -m studies.folds PAGE BASE RUN...` fits three times, from BASE (and the cars
 of other floors beside it). Each time another third is left out: of a longer log every third block
 of time, and of brief logs, which are a manoeuvre each, every third file. What is told of each log
 is pooled over the three, so all of it was judged where it was not fitted. How full the battery was
@@ -17,10 +17,10 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
-from countersteer.evaluation.compare import compare
 from countersteer.runs.run import read_run
 from countersteer.simulator import keep_programs
 from countersteer.tuning import fit, tune
+from countersteer.tuning.compare import compare
 from countersteer.tuning.windows import QUANTITIES
 
 FOLDS = 3
@@ -93,7 +93,7 @@ def page(logs: tune.Logs, pooled: dict[int, Judged], whole: dict[int, float], ba
     lines = [
         "# Logs predicted by cars that were not fitted to them",
         "",
-        f"Made by `python -m countersteer.evaluation.folds PAGE {base} RUN...`: three fits, each "
+        f"Made by `python -m studies.folds PAGE {base} RUN...`: three fits, each "
         "without another third of the blocks of time of a log, or of the files where a log is one "
         "brief manoeuvre. Median absolute errors after one second of open loop over the windows "
         "that were left out (if nothing changed); the last column is the RMS error of the wheel "

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from countersteer.batch.open_drives import batch, commands, drives
+from countersteer.batch.rollout import LANES
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
 from countersteer.drivers.replay import Replay
-from countersteer.evaluation.experiments.found import Found, Report, silent
-from countersteer.evaluation.open_drives import batch, commands, drives
-from countersteer.evaluation.rollout import LANES
+from countersteer.experiments.found import Found, Report, silent
 from countersteer.runs.run import Run, drawn_car
 from countersteer.task.turns import sideslip
 

@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from countersteer.batch.evaluate import interval
+from countersteer.batch.population import draw, load_population
+from countersteer.batch.rollout import LANES, rollouts
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed, pytree
 from countersteer.course.course import Course, from_segments
 from countersteer.drivers.drift_turn import STRAIGHT, DriftTurn, drift_turn
 from countersteer.drivers.driver import Observation, Status
-from countersteer.evaluation.evaluate import interval
-from countersteer.evaluation.experiments.found import Found, Report, silent
-from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.rollout import LANES, rollouts
+from countersteer.experiments.found import Found, Report, silent
 from countersteer.link.link import LINKS
 from countersteer.pilot import Pilot
 from countersteer.signals import Command, Scalar

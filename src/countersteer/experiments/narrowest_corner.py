@@ -19,6 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
+from countersteer.batch.evaluate import DRIFT
+from countersteer.batch.open_drives import batch, drives
+from countersteer.batch.rollout import LANES
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import from_segments
@@ -27,10 +30,7 @@ from countersteer.drivers.policy import library
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.drivers.turning import Turning
-from countersteer.evaluation.evaluate import DRIFT
-from countersteer.evaluation.experiments.found import Found, Report, silent
-from countersteer.evaluation.open_drives import batch, drives
-from countersteer.evaluation.rollout import LANES
+from countersteer.experiments.found import Found, Report, silent
 from countersteer.signals import Command, Scalar
 
 DRAWS = 512

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from countersteer.batch.population import Population, draw
+from countersteer.batch.rollout import LANES, Watch, watched
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
-from countersteer.evaluation.population import Population, draw
-from countersteer.evaluation.rollout import LANES, Watch, watched
 from countersteer.link.link import Link
 from countersteer.pilot import Pilot
 from countersteer.sensing.faults import Fault

@@ -14,9 +14,9 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.errors import InputError
-from countersteer.evaluation.experiments.control_rate import LONGEST, SPEED, corner
-from countersteer.evaluation.experiments.found import Found, Report, silent
-from countersteer.evaluation.open_turns import Series, series_of, stops
+from countersteer.experiments.control_rate import LONGEST, SPEED, corner
+from countersteer.experiments.found import Found, Report, silent
+from countersteer.experiments.open_turns import Series, series_of, stops
 from countersteer.pilot import Pilot
 from countersteer.runs.run import Run
 from countersteer.simulator import Simulator

@@ -13,7 +13,7 @@ import numpy as np
 
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.errors import InputError
-from countersteer.evaluation.local_regression import (
+from countersteer.experiments.local_regression import (
     LEAST,
     Line,
     Local,

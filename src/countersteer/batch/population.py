@@ -20,7 +20,7 @@ from countersteer.streams import Stream
 from countersteer.world import floor
 from countersteer.world.floor import LARGEST, Floor
 
-LIBRARY = importlib.resources.files("countersteer.evaluation") / "library"
+LIBRARY = importlib.resources.files("countersteer.batch") / "library"
 KINDS = ("within", "plus", "low", "high")
 START = {"along_m": 1.0, "offset_m": 1.0, "heading_deg": math.pi / 180}  # factors to SI
 

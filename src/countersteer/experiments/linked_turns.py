@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from countersteer.batch.population import draw, load_population
+from countersteer.batch.rollout import watched
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course, Turn
 from countersteer.drivers.drift_turn import drift_turn
-from countersteer.evaluation.experiments.found import Found, Report, silent
-from countersteer.evaluation.population import draw, load_population
-from countersteer.evaluation.rollout import watched
+from countersteer.experiments.found import Found, Report, silent
 from countersteer.pilot import Memory, Pilot
 from countersteer.signals import Scalar
 from countersteer.simulator import Loop, Simulator

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from countersteer.batch.rollout import LANES
 from countersteer.car.car import Car
 from countersteer.drivers.driver import Driver, Heard, Observation
 from countersteer.drivers.replay import Replay
 from countersteer.estimation.estimate import Estimate
-from countersteer.evaluation.rollout import LANES
 from countersteer.signals import Array, Command, Motion
 from countersteer.task.task import PERIOD
 from countersteer.world import planar

@@ -1,0 +1,1 @@
+"""Many cars at once: the engine, what varies, how many get round."""

@@ -1,1 +1,0 @@
-"""What a drive was worth: turns, laps, errors against a log."""

@@ -1,0 +1,1 @@
+"""Other people's logs to run folders: one format a file."""
