@@ -22,7 +22,7 @@ from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
 from countersteer.drivers.replay import Replay
 from countersteer.pilot import Pilot
-from countersteer.recording import about_run, drive
+from countersteer.recording import Drive, about_run, drive
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run, read_run
 from countersteer.simulator import Simulator, keep_programs
@@ -74,7 +74,7 @@ def log(car: Car, folder: Path, rng: np.random.Generator) -> Run:
     simulator, pilot = Simulator.of(None, car, seed=seed), Pilot.of(driver, None, car)
     about = about_run(simulator, pilot, None, "replay", BASE, 1, car, {"kind": "replay"})
     folder.mkdir()
-    drive(simulator, pilot, None, folder, about, 1, DURATION)
+    drive(Drive(simulator, pilot, None, about, DURATION), folder)
     return measured(read_run(folder), float(car.sensors.encoder.update), rng)
 
 

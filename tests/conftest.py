@@ -15,6 +15,7 @@ from countersteer.course.course import Course
 from countersteer.drivers.replay import Replay
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
+from countersteer.recording import Drive as Recorded
 from countersteer.recording import about_run
 from countersteer.recording import drive as write_drive
 from countersteer.runs.run import Run, read_run
@@ -186,7 +187,7 @@ def write_run(
     """A drive as a run's folder."""
     simulator, pilot = Simulator.of(course, car, **more), Pilot.of(driver, course, car)
     about = about_run(simulator, pilot, course, "replay", "rx7", 1, car, {"kind": "replay"})
-    write_drive(simulator, pilot, course, out, about, 1, longest)
+    write_drive(Recorded(simulator, pilot, course, about, longest), out)
     return read_run(out)
 
 

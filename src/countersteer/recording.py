@@ -7,25 +7,83 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.files import car_tables
+from countersteer.car.files import car_tables, load_car
 from countersteer.course.course import Course
 from countersteer.course.files import course_tables
+from countersteer.drivers.library import make_driver
+from countersteer.errors import InputError
+from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
+from countersteer.runs.files import read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
-from countersteer.sensing.faults import fault_tables
+from countersteer.sensing.faults import Fault, fault_tables
 from countersteer.sensing.suite import channels
 from countersteer.signals import truth_columns
 from countersteer.simulator import Record, Simulator
 from countersteer.task.task import PERIOD, Outcome, Sample, Task, summary
-from countersteer.world.floor import floor_tables
+from countersteer.world.floor import Floor, floor_tables
 
 VELOCITY = ("vx_mps", "vy_mps", "yaw_rate_radps")
+
+
+class Drive(NamedTuple):
+    """All that a recorded drive needs."""
+
+    simulator: Simulator
+    pilot: Pilot
+    course: Course | None
+    about: dict[str, Any]  # of `run.toml`
+    longest: float  # s
+
+
+def prepare(
+    course: Course,
+    car: Car,
+    driver: str,
+    *,
+    car_name: str = "rx7",
+    speed: float | None = None,
+    laps: int = 1,
+    estimate: str = "filter",
+    link: Link = ONBOARD,
+    dt: float = 0.001,
+    seed: int = 0,
+    charge: float = 1.0,
+    start: tuple[float, float, float] | None = None,
+    floor: Floor | None = None,
+    faults: tuple[Fault, ...] = (),
+) -> Drive:
+    """A drive of a car round a course, by a driver's name or file, who knows the car `car_name`.
+
+    `speed` (m/s) is what the driver is asked to bring to a turn, `charge` the battery's, 0 to 1.
+    Raises `InputError` where one of them is not what it should be.
+    """
+    if laps > 1 and not course.closed:
+        raise InputError(f"--laps {laps}: {course.name} is open, and driven once")
+    nominal = load_car(car_name)
+    made, tables = make_driver(driver, course, nominal, speed, laps, read_commands)
+    pilot = Pilot.of(made, course, nominal, estimate, link, dt)
+    simulator = Simulator.of(
+        course,
+        car,
+        link=link,
+        dt=dt,
+        seed=seed,
+        charge=charge,
+        start=start,
+        floor=floor,
+        faults=faults,
+    )
+    name = Path(driver).stem if driver.endswith((".csv", ".toml")) else driver
+    about = about_run(simulator, pilot, course, name, car_name, laps, nominal, tables)
+    # A lap at a crawl still ends.
+    return Drive(simulator, pilot, course, about, 20.0 + (course.lap_end(laps) or 0.0) / 0.3)
 
 
 def about_run(
@@ -132,20 +190,15 @@ class Interrupt:
 
 
 def drive(
-    simulator: Simulator,
-    pilot: Pilot,
-    course: Course | None,
-    folder: Path,
-    about: dict[str, Any],
-    laps: int,
-    longest: float,
-    report: Callable[[float, float], None] = lambda *_: None,
+    what: Drive, folder: Path, report: Callable[[float, float], None] = lambda *_: None
 ) -> dict[str, Any]:
-    """Drives to the goal, or for `longest` seconds, and writes the run's folder but its pictures.
+    """Drives to the goal, or for the longest time, and writes the run's folder but its pictures.
 
     Returns the summary. `report` is told the progress (m or s). On an interrupt the files are
     ended, and the drive counts as interrupted.
     """
+    simulator, pilot, course, about, longest = what
+    laps = int(about["laps"])
     task, pace = Task.of(course, laps), pace_of(simulator)
     score, outcome = task.init(), Outcome.DRIVING
     with Recorder(folder, about, channels=channels(simulator.car), pace=pace) as recorder:

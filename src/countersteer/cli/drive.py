@@ -1,14 +1,12 @@
 """`drive`: one closed-loop drive over a course."""
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from countersteer.cli.options import (
     DRIVERS,
     SPEEDS,
     Verbs,
-    check_laps,
     laps_and_link,
     number,
     physics,
@@ -68,16 +66,11 @@ def run(options: argparse.Namespace) -> int:
     """`drive`."""
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
-    from countersteer.drivers.library import make_driver
     from countersteer.link.link import LINKS
-    from countersteer.pilot import Pilot
-    from countersteer.recording import about_run
-    from countersteer.runs.files import read_commands
+    from countersteer.recording import prepare
     from countersteer.sensing.faults import read_fault
-    from countersteer.simulator import Simulator
 
     course, car = load_course(options.course), load_car(options.car, options.set)
-    check_laps(options, course)
     charge, start, speed, floor = 1.0, None, None, None
     if options.battery is not None:
         charge = options.battery
@@ -89,17 +82,15 @@ def run(options: argparse.Namespace) -> int:
         speed, most = options.speed_mps
         if most != speed:
             raise InputError("--speed-mps LO:HI: a range is drawn from with --cars only")
-    nominal, link = load_car(options.car), LINKS[options.link]
-    driver, tables = make_driver(
-        options.driver, course, nominal, speed, options.laps, read_commands
-    )
-    made = options.driver.endswith((".csv", ".toml"))
-    name = Path(options.driver).stem if made else options.driver
-    pilot = Pilot.of(driver, course, nominal, options.estimate, link, options.dt)
-    simulator = Simulator.of(
+    drive = prepare(
         course,
         car,
-        link=link,
+        options.driver,
+        car_name=options.car,
+        speed=speed,
+        laps=options.laps,
+        estimate=options.estimate,
+        link=LINKS[options.link],
         dt=options.dt,
         seed=options.seed,
         charge=charge,
@@ -107,10 +98,7 @@ def run(options: argparse.Namespace) -> int:
         floor=floor,
         faults=tuple(read_fault(text) for text in options.fault),
     )
-    about = about_run(simulator, pilot, course, name, options.car, options.laps, nominal, tables)
-    # A lap at a crawl still ends.
-    longest = 20.0 + (course.lap_end(options.laps) or 0.0) / 0.3
-    return record(options, simulator, pilot, course, about, longest, course.name)
+    return record(options, drive, course.name)
 
 
 def drawn_alone(options: argparse.Namespace, course: "Course", car: "Car") -> tuple[Any, ...]:

@@ -2,15 +2,17 @@
 
 import argparse
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from countersteer.errors import InputError
+from countersteer.progress import Progress
 
 if TYPE_CHECKING:
     from countersteer.course.course import Course
+
+__all__ = ["Progress"]  # and all else that is defined here
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 DRIVERS = ("drift-turn", "straighten")
@@ -150,30 +152,3 @@ def plans() -> dict[str, str]:
     from countersteer.drivers.plan import library
 
     return library()
-
-
-class Progress:
-    """A progress bar on a terminal; nothing elsewhere, and nothing with `--json`."""
-
-    def __init__(self, quiet: bool) -> None:
-        """Quiet shows nothing."""
-        self._quiet = quiet or not sys.stderr.isatty()
-        self._bar: Any = None
-
-    def __enter__(self) -> "Progress":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def show(self, done: float, of: float) -> None:
-        """Moves the bar."""
-        if self._quiet:
-            return
-        if self._bar is None:
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=of, leave=False, bar_format="{l_bar}{bar}| {elapsed}")
-        self._bar.n = min(done, of)
-        self._bar.refresh()

@@ -9,20 +9,10 @@ from typing import TYPE_CHECKING, Any
 from countersteer.cli.options import DONE, FAILED, INTERRUPTED, Progress
 
 if TYPE_CHECKING:
-    from countersteer.course.course import Course
-    from countersteer.pilot import Pilot
-    from countersteer.simulator import Simulator
+    from countersteer.recording import Drive
 
 
-def record(
-    options: argparse.Namespace,
-    simulator: "Simulator",
-    pilot: "Pilot",
-    course: "Course | None",
-    about: dict[str, Any],
-    longest: float,
-    place: str,
-) -> int:
+def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
     from countersteer.recording import drive
     from countersteer.runs.recorder import new_folder
@@ -33,12 +23,10 @@ def record(
     from countersteer.viewing.view import view_of
 
     keep_programs(batches=False)
-    folder = new_folder(options.out, f"{Path(place).stem}-{about['driver']}")
+    folder = new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}")
     painter = Painter(folder / "report.png")
     with Progress(options.json) as progress:
-        result = drive(
-            simulator, pilot, course, folder, about, about["laps"], longest, progress.show
-        )
+        result = drive(what, folder, progress.show)
     view = view_of(read_run(folder))
     (folder / "report.html").write_text(report_html(view))
     painter.draw(view)

@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.drivers.library import replay
     from countersteer.estimation.dead_reckoning import DeadReckoning
     from countersteer.pilot import Pilot
-    from countersteer.recording import about_run
+    from countersteer.recording import Drive, about_run
     from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
     last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
     longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
     about = about_run(simulator, pilot, course, "replay", name, laps, car, {"kind": "replay"})
-    return record(options, simulator, pilot, course, about, longest, options.source.stem)
+    return record(options, Drive(simulator, pilot, course, about, longest), options.source.stem)
 
 
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:

@@ -1,0 +1,170 @@
+"""What `import countersteer` gives: a drive, an evaluation, and what they are made of, by name."""
+
+import html
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from countersteer.batch import evaluate as evaluation
+from countersteer.batch.population import load_population
+from countersteer.car.files import load_car
+from countersteer.course.files import load_course
+from countersteer.drivers.driver import Driver
+from countersteer.drivers.library import make_driver
+from countersteer.errors import InputError
+from countersteer.link.link import LINKS
+from countersteer.progress import Progress
+from countersteer.recording import drive as record
+from countersteer.recording import prepare
+from countersteer.runs.files import read_commands
+from countersteer.runs.recorder import new_folder
+from countersteer.runs.run import Run as RunFolder
+from countersteer.runs.run import read_run
+from countersteer.simulator import keep_programs
+from countersteer.viewing.picture import draw_picture
+from countersteer.viewing.report import report_html
+from countersteer.viewing.view import view_of
+
+
+class Run:
+    """A drive that was recorded: simulated, imported or real. In a notebook it shows its report.
+
+    `columns` are those of `truth.csv` (NumPy arrays, units in the names), `commands` and
+    `telemetry` the other tables, `about` is `run.toml`, `folder` says where all of it is.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        """From a folder that was read."""
+        self.folder, self.about = folder.path, folder.about
+        self.commands, self.telemetry = folder.commands, folder.telemetry
+        self.columns: dict[str, np.ndarray] = folder.truth or {}
+        self._summary = folder.summary
+
+    @property
+    def outcome(self) -> str:
+        """How the drive ended, in words."""
+        return str(self._summary.get("status", "not judged"))
+
+    @property
+    def success(self) -> bool:
+        """Whether it reached its goal and touched no wall."""
+        return bool(self._summary.get("success", False))
+
+    @property
+    def turns(self) -> list[dict[str, Any]]:
+        """The turns as the judge found them; units are in the names."""
+        return list(self._summary.get("turns", []))
+
+    def to_pandas(self) -> Any:
+        """The columns as a data frame. Raises `ImportError` where pandas is missing."""
+        try:
+            import pandas  # type: ignore[import-untyped]  # no package of ours needs it
+        except ImportError:
+            raise ImportError("to_pandas needs pandas: pip install pandas") from None
+        return pandas.DataFrame(dict(self.columns))
+
+    def __repr__(self) -> str:
+        """In a line."""
+        end = float(self.columns["time_s"][-1]) if len(self.columns) else 0.0
+        return f"<Run {self.folder}: {self.outcome}, {len(self.turns)} turns, {end:.2f} s>"
+
+    def _repr_html_(self) -> str:
+        """The report, playing."""
+        page = html.escape((self.folder / "report.html").read_text(encoding="utf-8"))
+        return f'<iframe srcdoc="{page}" width="100%" height="760" frameborder="0"></iframe>'
+
+
+def load_run(folder: str | Path) -> Run:
+    """A run's folder. Raises `InputError` where it is not one."""
+    return Run(read_run(Path(folder)))
+
+
+def load_driver(
+    name: str, course: Any, car: Any, speed: float | None = None, laps: int = 1
+) -> Driver:
+    """A driver by name or file, for a `Course` and a nominal `Car`; `speed` in m/s."""
+    return make_driver(name, course, car, speed, laps, read_commands)[0]
+
+
+def drive(
+    course: str,
+    car: str = "rx7",
+    driver: str = "drift-turn",
+    *,
+    seed: int = 0,
+    set: Sequence[str] = (),  # noqa: A002  # as on the command line
+    speed: float | None = None,
+    laps: int = 1,
+    battery: float = 1.0,
+    estimate: str = "filter",
+    link: str = "onboard",
+    dt: float = 0.001,
+    out: str | Path | None = None,
+) -> Run:
+    """Drives once and records it, as `countersteer drive` does; names are those of its options.
+
+    `set` overrides parameters of the simulated car (`"battery.wear=0.3"`), which the driver is not
+    told of. `speed` in m/s, `battery` is the charge from 0 to 1, `dt` in seconds. The run's folder
+    is `out`, or a new one under `runs/`. Raises `InputError` with one line where an input is wrong.
+    """
+    keep_programs(batches=False)
+    where, simulated = load_course(course), load_car(car, set)
+    if link not in LINKS:
+        raise InputError(f"link: one of {', '.join(LINKS)}, not {link}")
+    what = prepare(
+        where,
+        simulated,
+        driver,
+        car_name=car,
+        speed=speed,
+        laps=laps,
+        estimate=estimate,
+        link=LINKS[link],
+        dt=dt,
+        seed=seed,
+        charge=battery,
+    )
+    name = f"{Path(where.name).stem}-{what.about['driver']}"
+    folder = new_folder(None if out is None else Path(out), name)
+    with Progress() as progress:
+        record(what, folder, progress.show)
+    run = read_run(folder)
+    view = view_of(run)
+    (folder / "report.html").write_text(report_html(view))
+    draw_picture(view, folder / "report.png")
+    return Run(run)
+
+
+def evaluate(
+    course: str,
+    driver: str = "drift-turn",
+    *,
+    trials: int = 1000,
+    car: str = "rx7",
+    cars: str = "around",
+    seed: int = 0,
+    speed: tuple[float, float] | None = None,
+    laps: int = 1,
+    estimate: str = "filter",
+    link: str = "onboard",
+    dt: float = 0.001,
+) -> dict[str, Any]:
+    """A driver over random cars, as `countersteer evaluate` does: what its JSON has of one driver.
+
+    `speed` is a range in m/s. Fastest as the first thing that a process does with JAX.
+    """
+    keep_programs(blocks=True, cores=os.cpu_count() or 1)
+    where, nominal = load_course(course), load_car(car)
+    if where.goal_distance is None:
+        raise InputError(f"{course}: has no goal, so nothing tells a success")
+    seeds = range(seed, seed + trials)
+    many = evaluation.Trials(
+        where, nominal, nominal, load_population(cars), seeds, speed, laps, LINKS[link],
+        estimate, dt,
+    )  # fmt: skip
+    with Progress() as progress:
+        score = many.run(lambda v: load_driver(driver, where, nominal, v, laps), progress.show)
+    return evaluation.results(score, seeds)
