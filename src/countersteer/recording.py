@@ -24,8 +24,8 @@ from countersteer.runs.files import read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
 from countersteer.sensing.faults import Fault, fault_tables
 from countersteer.sensing.suite import channels
-from countersteer.signals import truth_columns
-from countersteer.simulator import Record, Simulator
+from countersteer.signals import Motion, Wheels, truth_columns
+from countersteer.simulator import PIECE, Record, Simulator
 from countersteer.task.task import PERIOD, Outcome, Sample, Task, summary
 from countersteer.world.floor import Floor, floor_tables
 
@@ -228,6 +228,17 @@ def drive(
         result = summary(score, outcome)
         recorder.finish(result)
     return result
+
+
+def warm_up(what: Drive) -> None:
+    """Compiles the judge of the drive: beside the loop's compilation, which takes all the time."""
+    pace, task = pace_of(what.simulator), Task.of(what.course, int(what.about["laps"]))
+    control = what.pilot.control
+    ticks = max(1, round(PIECE / what.simulator.dt / control)) * control
+    zero = np.zeros(len(range(0, ticks, pace.truth)))
+    parts: list[Any] = [*[zero] * 6, Wheels(*[zero] * 4), *[zero] * 5]
+    still = Motion(*parts)
+    task.follow(task.init(), Sample(zero, still, zero, zero, zero))
 
 
 def samples(simulator: Simulator, record: Record, rows: np.ndarray) -> Sample:

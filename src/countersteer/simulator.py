@@ -72,7 +72,7 @@ class Record(NamedTuple):
     readings: Readings
     wall_contacts: Scalar
     rolled_over: Scalar
-    status: Status  # what the driver said it was about
+    status: Status  # what the driver said it was about, at its start
 
 
 @pytree
@@ -292,11 +292,12 @@ def tick(
     def act(memory: Memory) -> Memory:
         return pilot.act(memory, heard(simulator, loop), loop.tick)[1]
 
+    said = pilot.status(memory)
     # Also where each tick has a decision: what is compiled apart comes to the same digits.
     now = loop.tick % pilot.control == 0 if pilot.control > 1 else loop.tick >= 0
     memory = jax.lax.cond(now, act, lambda same: same, memory)
     loop, record = advance(simulator, loop, memory.command, now)
-    return loop, memory, record._replace(status=pilot.status(memory))
+    return loop, memory, record._replace(status=said)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -319,9 +320,14 @@ def steps(
     """The same with any pilot, a decision at a time."""
     records = []
     for _ in range(ticks // pilot.control):
+        said = pilot.status(memory)
         command, memory = pilot.act(memory, simulator.readings(loop), loop.tick)
         loop, record = simulator.apply(loop, command, pilot.control)
-        status = jax.tree.map(lambda s: np.full(pilot.control, s), pilot.status(memory))
+        status = jax.tree.map(
+            lambda before, after: np.array([before, *[after] * (pilot.control - 1)]),
+            said,
+            pilot.status(memory),
+        )
         records.append(jax.tree.map(np.asarray, record)._replace(status=status))
     return loop, memory, jax.tree.map(lambda *parts: np.concatenate(parts), *records)
 

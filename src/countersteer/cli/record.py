@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,8 +26,11 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     keep_programs(batches=False)
     folder = new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}")
     painter = Painter(folder / "report.png")
+    beside = threading.Thread(target=prepare_the_rest, args=(what,))
+    beside.start()
     with Progress(options.json) as progress:
         result = drive(what, folder, progress.show)
+    beside.join()
     view = view_of(read_run(folder))
     (folder / "report.html").write_text(report_html(view))
     painter.draw(view)
@@ -38,6 +42,15 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
         print("countersteer: interrupted", file=sys.stderr)
         return INTERRUPTED
     return DONE if result["success"] else FAILED
+
+
+def prepare_the_rest(what: "Drive") -> None:
+    """Compiles what judge and page need, on another core than the one that compiles the loop."""
+    from countersteer.recording import warm_up
+    from countersteer.viewing import view
+
+    warm_up(what)
+    view.warm_up(what.simulator.car, getattr(what.simulator.world, "floor", None))
 
 
 def print_result(result: dict[str, Any], folder: Path) -> None:

@@ -16,6 +16,7 @@ from countersteer.world import planar
 from countersteer.world.floor import Floor, floor_of_run
 
 PERIOD = 0.01  # s between two samples, at least
+ROWS = 1024  # whose forces are computed at once: always as many, so that there is one program
 WHEELS = ("fl", "fr", "rl", "rr")
 
 
@@ -60,6 +61,13 @@ def view_of(run: Run) -> dict[str, Any]:
         "sonar": echoes(run, car) if place != "open floor" else [],
         "wheels": wheel_views(car, motions(run, car), floor_of_run(about), every),
     } | {name: values[every].tolist() for name, values in shown.items()}
+
+
+def warm_up(car: Car, floor: Floor | None = None) -> None:
+    """Compiles what a view of such a run needs, so that it is there when the drive is over."""
+    still = planar.initial_state(car, 1e-3, slots=1).motion
+    motion = jax.tree.map(lambda leaf: np.zeros(1) + leaf, still)
+    wheel_views(car, motion, floor, slice(None))
 
 
 def echoes(run: Run, car: Car) -> list[dict[str, Any]]:
@@ -119,12 +127,13 @@ def wheel_views(
 ) -> list[dict[str, list[float]]]:
     """The forces at each wheel, in its own axes."""
     thin = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[every], motion)
-    count = len(thin.x)
-    # As many rows for runs of about a length, so that they share a program.
-    rows = np.minimum(np.arange(1 << math.ceil(math.log2(max(count, 1)))), count - 1)
+    count, blocks = len(thin.x), []
     with jax.enable_x64(False):
         single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), (car, floor))
-        found = _forces(*single, jax.tree.map(lambda leaf: leaf[rows], thin))
+        for first in range(0, count, ROWS):
+            rows = np.minimum(np.arange(first, first + ROWS), count - 1)
+            blocks.append(_forces(*single, jax.tree.map(lambda leaf, r=rows: leaf[r], thin)))
+    found = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
     names = {
         "force_x_n": "force_x",
         "force_y_n": "force_y",
@@ -133,10 +142,7 @@ def wheel_views(
         "angle_rad": "angle",
     }
     return [
-        {
-            name: np.asarray(getattr(forces, field))[:count].astype(float).tolist()
-            for name, field in names.items()
-        }
+        {name: getattr(forces, field).astype(float).tolist() for name, field in names.items()}
         for forces in found
     ]
 
