@@ -1,5 +1,7 @@
 """The pilot stands alone: what it is told is all that it needs, and all that it can reach."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -7,16 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from conftest import driven
 from countersteer import cli
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
+from countersteer.errors import InputError
 from countersteer.estimation.library import ESTIMATORS
 from countersteer.pilot import Pilot, pilot_of_run
 from countersteer.runs.files import read_commands
 from countersteer.runs.run import read_run
 from countersteer.runs.telemetry import readings_at
 from countersteer.sensing.suite import channels
+from countersteer.signals import Command
 from countersteer.simulator import Simulator, scan
 from countersteer.world.state import State
 
@@ -124,3 +129,61 @@ def test_the_loop_by_hand_is_the_loop_of_run_to_the_digit():
         jax.tree.leaves((record.motion, record.command)), jax.tree.leaves(stepped), strict=True
     ):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", ["my_world", "wall_follower"])
+def test_the_examples_run_as_they_stand(name, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    last = done.stdout.splitlines()[-1].split()
+    x, y = (float(last[last.index(name) + 1]) for name in ("x", "y"))
+    assert x > 2.4
+    assert abs(y) < 0.05
+
+
+def test_another_world_is_shorter_than_sixty_lines():
+    assert len((EXAMPLES / "my_world.py").read_text().splitlines()) < 60
+
+
+class Counted:
+    """Asks for nothing, and counts how often it is asked."""
+
+    def __init__(self, answer=None):
+        self.calls, self.answer = 0, answer
+
+    def reset(self, key):
+        return 0
+
+    def act(self, memory, observation):
+        self.calls += 1
+        return (Command(0.0, 0.0), memory) if self.answer is None else self.answer
+
+
+@pytest.mark.parametrize(("period", "calls"), [(None, 101), (0.001, 501), (0.02, 26)])
+def test_a_driver_in_python_decides_200_times_a_second_unless_it_says_otherwise(period, calls):
+    driver = Counted()
+    if period is not None:
+        driver.period = period
+    record = driven(None, CAR, driver, 0.5)
+    assert driver.calls == pytest.approx(calls, abs=2)
+    assert np.all(np.diff(np.nonzero(record.fresh)[0]) == round(1000 * (period or 0.005)))
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        (Command(0.1, 0.0), "must return .Command.throttle, steering., memory."),
+        ((Command(0.1, 0.0), 1, 2), "must return"),
+        ((0.3, None), "must return a Command"),
+        ((Command("fast", 0.0), None), "throttle must be a finite number, not 'fast'"),
+        ((Command(0.1, float("nan")), None), "steering must be a finite number, not nan"),
+        ("go", "must return"),
+    ],
+)
+def test_a_wrong_answer_of_a_driver_is_told_in_one_line(answer, says):
+    with pytest.raises(InputError, match=f"Counted.act.*{says}") as raised:
+        driven(None, CAR, Counted(answer), 0.1)
+    assert len(str(raised.value).splitlines()) == 1

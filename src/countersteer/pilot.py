@@ -221,7 +221,8 @@ def traceable(driver: Any) -> bool:
 def checked(driver: Any, answer: Any) -> tuple[Command, Any]:
     """What `act` of a driver in Python returned. Raises `InputError` where it is wrong."""
     name = f"{type(driver).__name__}.act"
-    if not isinstance(answer, tuple) or len(answer) != 2:
+    # A command alone is a pair as well.
+    if isinstance(answer, Command) or not isinstance(answer, tuple) or len(answer) != 2:
         raise InputError(
             f"{name} must return (Command(throttle, steering), memory), not {answer!r:.60}"
         )

@@ -69,8 +69,8 @@ def from_sonar(run: Run) -> Speed:
 
     Through the echoes of each 0.2 s the line is laid that half of them are nearest to (least median
     of squares); echoes off it are spikes, and by least squares of the rest the slope is found, with
-    deviation `ASTRAY` s / sqrt(sum (t - mean t)²). The spread s is that of all windows' echoes about their
-    lines. A window in which most pings are spikes or unanswered gives no value.
+    deviation `ASTRAY` s / sqrt(sum (t - mean t)²). The spread s is that of all windows' echoes
+    about their lines. A window in which most pings are spikes or unanswered gives no value.
     """
     windows = list(_windows(*_reported(run, "sonar_front_m")))
     lines = [_least_median(t, d) for t, d, _ in windows]
