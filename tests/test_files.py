@@ -17,17 +17,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from conftest import driven, write_run
 from countersteer import cli
 from countersteer.car.files import library, load_car, parameters, save_car
 from countersteer.completion import every_action, script
 from countersteer.course.course import grip_speed, place, progress
 from countersteer.course.files import library as courses
 from countersteer.course.files import load_course
+from countersteer.drivers.drift_turn import drift_turn
+from countersteer.drivers.replay import Replay
+from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
+from countersteer.recording import frames
 from countersteer.runs.files import column_rows, command_rows, read_commands, read_table
-from countersteer.runs.recorder import new_folder
+from countersteer.runs.recorder import Pace, Recorder, new_folder
 from countersteer.runs.run import read_run
+from countersteer.sensing.suite import channels
 from countersteer.text import read_text
+from countersteer.viewing.picture import draw_picture
+from countersteer.viewing.report import report_html
+from countersteer.viewing.view import view_of
 
 COMMANDS = "time_s,throttle,direction,steering_deg\n"
 
@@ -429,7 +438,7 @@ def test_an_interrupt_leaves_files_that_read(tmp_path):
     assert "Traceback" not in errors
     run = read_run(out)
     assert len(run.truth) > 10
-    assert json.loads((out / "summary.json").read_text())["status"] == "interrupted"
+    assert json.loads((out / "summary.json").read_text())["outcome"] == "interrupted"
 
 
 def test_a_full_disk_is_one_line_and_what_was_written_reads(tmp_path):
@@ -505,3 +514,52 @@ def test_the_cars_of_the_examples_load():
     cars = [load_car(str(path)) for path in paths]
     assert len({car.tires.front.friction for car in cars}) == 3
     assert len({car.body.mass for car in cars}) == 1
+
+
+def test_frames_one_at_a_time_make_the_tables_of_frames_in_pieces(tmp_path):
+    """A real car's recorder is fed as readings come; a simulation's by half seconds."""
+    course, car = load_course("box"), load_car("rx7", ["sensors.lidar.beams=5"])
+    record = driven(course, car, drift_turn(course, car), 0.4)
+    whole = frames(record, len(record.tick))
+    pace = Pace(0.001, 5, 5, True)
+    for name, step in (("pieces", 100), ("single", 1)):
+        (tmp_path / name).mkdir()
+        with Recorder(tmp_path / name, {"car_name": "rx7"}, None, channels(car), pace) as recorder:
+            for first in range(0, len(record.tick), step):
+                recorder.record(jax.tree.map(lambda leaf, a=first, n=step: leaf[a : a + n], whole))
+    for table in ("commands", "telemetry", "truth"):
+        one, other = ((tmp_path / n / f"{table}.csv").read_text() for n in ("pieces", "single"))
+        assert one == other
+        assert len(one.splitlines()) > 50
+
+
+def test_frames_of_a_car_with_a_clock_of_its_own_are_all_kept(tmp_path):
+    """Every 9 to 11 ms, a millisecond after the readings were taken."""
+    car = load_car("rx7")
+    record = driven(
+        None, car, Replay(times=np.zeros(1), throttle=np.ones(1), steering=np.zeros(1)), 1.0
+    )
+    ticks = np.cumsum(np.random.default_rng(0).integers(9, 12, 90)) + 1
+    whole = frames(record, len(record.tick))
+    rows = jax.tree.map(lambda leaf: leaf[ticks], whole)._replace(fresh=np.ones(90, bool))
+    rows = rows._replace(readings=jax.tree.map(lambda leaf: leaf[ticks - 1], whole.readings))
+    with Recorder(tmp_path, {"car_name": "rx7"}, None, channels(car), Pace(0.001, 5, 5, True)) as r:
+        for i in range(90):
+            r.record(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], rows))
+    table = read_table(tmp_path / "telemetry.csv", ("time_s",))
+    assert len(table) == 90
+    assert np.isfinite(table["gyro_radps"]).sum() == 90
+    assert len(read_table(tmp_path / "truth.csv", ("time_s",))) == 90
+
+
+def test_a_run_that_was_killed_still_has_a_page_and_a_picture(tmp_path):
+    (tmp_path / "run").mkdir()
+    course, car = load_course("straight"), load_car("rx7")
+    write_run(tmp_path / "run", course, car, straighten(course, car), 1.0)
+    (tmp_path / "run" / "summary.json").unlink()
+    truth = tmp_path / "run" / "truth.csv"
+    truth.write_text("\n".join(truth.read_text().splitlines()[:2]) + "\n")
+    view = view_of(read_run(tmp_path / "run"))
+    assert "not judged" in report_html(view)
+    draw_picture(view, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 5000

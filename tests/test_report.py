@@ -49,7 +49,7 @@ def view() -> dict:
     return {
         "title": "a test </script><b>",
         "summary": {
-            "completed": True, "status": "goal reached", "wall_contacts": 0, "lap_time_s": 2.0,
+            "completed": True, "outcome": "goal reached", "wall_contacts": 0, "lap_time_s": 2.0,
             "turns": [turn],
         },
         "walls_m": [[-2, -2, 2, -2], [2, -2, 2, 2]],

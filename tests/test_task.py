@@ -15,6 +15,7 @@ from countersteer.course.course import Course, Turn, from_segments
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.replay import Replay
+from countersteer.runs.files import Table
 from countersteer.runs.importers.dart import import_dart
 from countersteer.runs.run import read_run
 from countersteer.signals import Motion, Wheels
@@ -150,6 +151,58 @@ def test_what_goes_too_far_in_one_turn_is_not_into_the_next():
     assert second.heading_error_deg == pytest.approx(0, abs=0.5)
 
 
+@pytest.mark.parametrize("gap", [1.0, 2.0, 3.0])
+def test_two_corners_of_one_hand_in_one_slide_are_two_turns(gap):
+    """A U in a single drift: the nose is into the second corner while the first is still near."""
+    u = from_segments(
+        "u", 1.4, False,
+        [("straight", 4.0, 0.0), ("turn", math.pi / 2, 0.0), ("straight", gap, 0.0),
+         ("turn", math.pi / 2, 0.0), ("straight", 4.0, 0.0)],
+    )  # fmt: skip
+    after = 1.8 + (gap + 0.8) / 2
+    points = [(0, 0), (1.8, 0), (after, 180), (9, 180)]
+    slip = [(1.8, 0), (2.0, -40), (after, -40), (after + 0.2, 0)]
+    _, (first, second) = judge(u, path(u, 2.0, points, slip, time=3.6 + gap / 2))
+    assert first.end_s == pytest.approx(second.begin_s)
+    assert first.peak_sideslip_deg == pytest.approx(40, abs=1)
+    assert second.peak_sideslip_deg == pytest.approx(40, abs=1)
+    assert second.heading_error_deg == pytest.approx(0, abs=0.5)
+    assert second.heading_overshoot_deg == pytest.approx(0, abs=0.5)
+
+
+@pytest.mark.parametrize("turned", [-0.5, 0.3])
+def test_a_car_that_starts_turned_is_judged_by_the_corridor(turned):
+    """`[start] heading_deg` is the car's, not the course's."""
+    x, y, heading = RIGHT.start
+    askew = dataclasses.replace(RIGHT, start=(x, y, heading + turned))
+    points = [(0, math.degrees(turned)), (0.4, 0), *CLEAN[1:]]
+    _, (turn,) = judge(askew, path(askew, 2.0, points))
+    _, (clean,) = judge(RIGHT, path(RIGHT, 2.0, CLEAN))
+    assert dataclasses.asdict(turn) == pytest.approx(dataclasses.asdict(clean), abs=1e-9)
+
+
+def test_corners_of_rounded_courses_have_the_bearings_of_their_straights():
+    course = load_course("bends")
+    corners = turns.corners_of(course, 1, float)
+    bearing = course.start[2]
+    for corner, before in zip(course.turns_ahead(1), corners.before, strict=True):
+        assert math.remainder(before - bearing, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+        bearing += corner.angle
+
+
+def test_the_speed_of_entry_is_that_of_the_last_time_the_car_came_by():
+    """To 0.2 m before the corner at 2 m/s, back by 1 m, and on at 0.8 m/s."""
+    v = [(0, 2.0), (1.0, 2.0), (1.9, 2.0), (1.91, -2.0), (2.4, -2.0), (2.41, 0.8), (9, 0.8)]
+    time = np.arange(0, 5, 0.005)
+    along = np.cumsum(0.005 * np.interp(time, *np.transpose(v)))
+    corner = float(time[np.argmax((time > 2.5) & (along > 3.9))])
+    samples = path(RIGHT, v, [(0, 0), (corner, 0), (corner + 0.5, -90), (9, -90)], time=5)
+    x, y = (np.interp(along, RIGHT.marks, RIGHT.line[:, i]) for i in (0, 1))
+    samples = samples._replace(motion=samples.motion._replace(x=x, y=y))
+    _, (turn,) = judge(RIGHT, samples)
+    assert turn.entry_speed_mps == pytest.approx(0.8, abs=0.01)
+
+
 def test_turns_of_a_slalom_are_linked():
     """The other hand begins while the first has not ended, and ends it."""
     ess = from_segments(
@@ -277,13 +330,45 @@ def test_a_run_s_folder_is_judged_as_the_drive_that_made_it(tmp_path):
     assert told | {"turns": []} == run.summary | {"turns": []}
 
 
+def test_a_log_may_rest_have_gaps_and_empty_poses(tmp_path):
+    """As logs of real cars do; a simulated drive may do none of it."""
+    course = load_course("box")
+    (tmp_path / "run").mkdir()
+    run = write_run(tmp_path / "run", course, CAR, drift_turn(course, CAR), 12.0)
+    _, told = judge_run(run, course)
+    poses = Table({n: run.truth[n][::2].copy() for n in ("time_s", "x_m", "y_m", "heading_rad")})
+    poses["heading_rad"] = np.arctan2(np.sin(poses["heading_rad"]), np.cos(poses["heading_rad"]))
+    poses["heading_rad"][40] = poses["x_m"][90] = np.nan
+    rest = np.arange(0, 7.0, 0.01)
+    late = {n: np.concatenate([np.full(len(rest), c[0]), c]) for n, c in poses.items()}
+    late["time_s"] = np.concatenate([rest, 7.0 + poses["time_s"]])
+    gap = (late["time_s"] < 7.0 + 2.6) | (late["time_s"] > 7.0 + 2.9)
+    late = Table({n: c[gap] for n, c in late.items()})
+    _, found = judge_run(dataclasses.replace(run, truth=late, telemetry=None), course)
+    assert found["outcome"] == "goal reached"
+    for one, other in zip(found["turns"], told["turns"], strict=True):
+        assert one["begin_s"] == pytest.approx(other["begin_s"] + 7.0, abs=0.02)
+        assert one["heading_error_deg"] == pytest.approx(other["heading_error_deg"], abs=1.5)
+        assert one["peak_sideslip_deg"] == pytest.approx(other["peak_sideslip_deg"], abs=1.5)
+
+
+def test_a_sample_that_is_no_number_ends_a_drive_and_spoils_no_turn():
+    samples = path(RIGHT, 2.0, CLEAN)
+    vx = samples.motion.vx.copy()
+    vx[420:] = np.nan
+    score, (turn,) = judge(RIGHT, samples._replace(motion=samples.motion._replace(vx=vx)))
+    assert Outcome.of(score.outcome) == Outcome.LOST
+    told = dataclasses.asdict(turn)
+    assert all(np.isfinite(value) for value in told.values() if value is not None)
+
+
 def test_without_a_course_a_drive_is_done_when_it_is_over(tmp_path):
     driver = Replay(times=np.zeros(1), throttle=np.array([0.5]), steering=np.zeros(1))
     (tmp_path / "run").mkdir()
     run = write_run(tmp_path / "run", None, CAR, driver, 1.0)
     _, told = judge_run(run, None)
     assert told == run.summary == summary(judge_run(run, None)[0], Outcome.DONE)
-    assert told["status"] == "done"
+    assert told["outcome"] == "done"
     assert told["turns"] == []
 
 

@@ -46,7 +46,7 @@ class Run:
     @property
     def outcome(self) -> str:
         """How the drive ended, in words."""
-        return str(self._summary.get("status", "not judged"))
+        return str(self._summary.get("outcome", "not judged"))
 
     @property
     def success(self) -> bool:

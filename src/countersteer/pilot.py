@@ -34,6 +34,9 @@ from countersteer.streams import Stream
 PYTHON_PERIOD = 0.005  # s between two decisions of a driver in plain Python, unless it has its own
 
 
+LOCKS = (-math.pi / 2, math.pi / 2)  # rad, that a car can be asked to steer
+
+
 class Memory(NamedTuple):
     """What the pilot carries from one decision to the next."""
 
@@ -96,13 +99,17 @@ class Pilot:
 
     def typed(self, dtype: Any) -> "Pilot":
         """The same, estimating in a precision."""
-        estimator: Estimator = jax.tree.map(np.dtype(dtype).type, self.estimator)
+        real = np.dtype(dtype).type
+        estimator: Estimator = jax.tree.map(
+            lambda leaf: real(leaf) if _is_real(leaf) else leaf, self.estimator
+        )
         return dataclasses.replace(self, estimator=estimator)
 
     @property
     def dtype(self) -> Any:
         """The precision that it estimates in."""
-        return np.dtype(getattr(jax.tree.leaves(self.estimator)[0], "dtype", np.float64))
+        reals = [leaf for leaf in jax.tree.leaves(self.estimator) if _is_real(leaf)]
+        return np.dtype(getattr(reals[0], "dtype", np.float64) if reals else np.float64)
 
     def rerun(self, seed: int, readings: Readings, ticks: Array) -> Command:
         """What it asks for at the ticks (n,) of its decisions: it needs no car for that.
@@ -143,7 +150,8 @@ class Pilot:
             estimate, observation = _compiled_observe(silent, bare, readings, jnp.asarray(tick))
             answer = self.driver.act(memory.driver, jax.tree.map(np.asarray, observation))
             command, own = checked(self.driver, answer)
-            command = Command(*map(self.dtype.type, command))
+            asked = (np.clip(command.throttle, -1, 1), np.clip(command.steering, *LOCKS))
+            command = Command(*map(self.dtype.type, asked))
             return command, Memory(estimate, own, command)
 
     def observe(self, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Any, Observation]:
@@ -181,7 +189,7 @@ def _act(pilot: Pilot, memory: Memory, readings: Readings, tick: Scalar) -> tupl
     after = Memory(
         estimate,
         jax.tree.map(_like, own, memory.driver),
-        jax.tree.map(_like, command, memory.command),
+        jax.tree.map(_like, bounded(command), memory.command),
     )
     return after.command, after
 
@@ -206,6 +214,10 @@ def pilot_of_run(about: Mapping[str, Any], read: Read) -> Pilot:
     course = course_of_run(dict(about))
     if not isinstance(about.get("nominal"), dict) or course is None:
         raise InputError("run.toml: tells no [nominal] car or no [course]: it holds no pilot")
+    if about.get("estimate") not in ESTIMATORS or about["estimate"] == "truth":
+        raise InputError(
+            f"run.toml: estimate {about.get('estimate')}: it needs what no car reports"
+        )
     nominal = car_from_tables(about["nominal"], "run.toml: nominal")
     driver = driver_of_tables(about["pilot"], course, nominal, int(about["laps"]), read)
     link, dt = LINKS[about["link"]["name"]], float(about["rates"]["dt_s"])
@@ -239,6 +251,18 @@ def checked(driver: Any, answer: Any) -> tuple[Command, Any]:
         if not math.isfinite(number):
             raise InputError(f"{name}: {key} must be a finite number, not {value!r:.60}")
     return Command(*map(float, command)), memory
+
+
+def bounded(command: Command) -> Command:
+    """What a car can be asked for: throttle in ±1, steering within a right angle."""
+    return Command(jnp.clip(command.throttle, -1.0, 1.0), jnp.clip(command.steering, *LOCKS))
+
+
+def _is_real(leaf: Any) -> bool:
+    """Whether a leaf holds real numbers: no count, and no key."""
+    if isinstance(leaf, float):
+        return True
+    return bool(jnp.issubdtype(getattr(leaf, "dtype", np.int32), jnp.floating))
 
 
 def _typed(leaf: Any, dtype: Any) -> Any:

@@ -95,7 +95,6 @@ class Channel(NamedTuple):
 
 
 INF = float("inf")
-TIME = Channel("time_s", "s", 0.0, INF, "time since the start")
 # Ground truth as `truth.csv` holds it: the simulated state, or motion capture of a real car.
 TRUTH = (
     Channel("x_m", "m", -INF, INF, "centre of mass, east"),

@@ -160,7 +160,7 @@ class Simulator:
             return begin(self)
 
     def readings(self, loop: Loop) -> Readings:
-        """What has reached the pilot, and the ground truth, of which it makes no use."""
+        """What has reached the pilot; and the ground truth, for the estimator `truth` alone."""
         return heard(self, loop)
 
     def apply(self, loop: Loop, command: Command, ticks: int) -> tuple[Loop, Record]:
@@ -183,13 +183,20 @@ class Simulator:
             loop, memory = begin(self), pilot.init(self.root)
         before = None
         for _ in range(math.ceil(longest / (ticks * self.dt))):
-            with self._precision():
-                loop, memory, record = piece(self, pilot, ticks, loop, memory)
+            try:
+                with self._precision():
+                    loop, memory, record = piece(self, pilot, ticks, loop, memory)
+            except BaseException:
+                # What was driven before a driver failed is not lost.
+                if before is not None:
+                    yield jax.tree.map(np.asarray, before)
+                raise
             # This piece is computed while the one before it is read.
             if before is not None:
                 yield jax.tree.map(np.asarray, before)
             before = record
-        yield jax.tree.map(np.asarray, before)
+        if before is not None:
+            yield jax.tree.map(np.asarray, before)
 
     def record(self, pilot: Pilot, longest: float) -> Record:
         """The whole of `run` at once, cut off at `longest`: for drives of seconds to minutes."""

@@ -1,11 +1,13 @@
 """What the judge says of a run that is a folder: simulated, imported or real."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
 from countersteer.course.course import Course
 from countersteer.errors import InputError
+from countersteer.runs.files import Table
 from countersteer.runs.run import Run, drawn_car
 from countersteer.signals import Motion, Wheels
 from countersteer.task.task import PERIOD, Outcome, Sample, Score, Task, summary
@@ -20,18 +22,20 @@ def samples_of(run: Run) -> Sample:
     """
     if run.truth is None or not len(run.truth):
         raise InputError(f"{run.path}: has no truth.csv, so nothing tells where the car was")
-    measured = read_measured(run, drawn_car(run.about))
+    posed = np.isfinite(run.truth["x_m"] + run.truth["y_m"] + run.truth["heading_rad"])
+    if not posed.any():
+        raise InputError(f"{run.path}: truth.csv holds no pose")
+    table = Table({name: column[posed] for name, column in run.truth.items()})
+    table["heading_rad"] = np.unwrap(table["heading_rad"])
+    measured = read_measured(dataclasses.replace(run, truth=table), drawn_car(run.about))
     assert measured.vx is not None
     assert measured.vy is not None
     assert measured.yaw_rate is not None
-    table = run.truth
     begin = table["time_s"][0]
     steps = round((table["time_s"][-1] - begin) / PERIOD)
     time = begin + PERIOD * np.arange(steps + 1)
-    heading = np.unwrap(table["heading_rad"])
-    places = [
-        np.interp(time, table["time_s"], line) for line in (table["x_m"], table["y_m"], heading)
-    ]
+    poses = (table[name] for name in ("x_m", "y_m", "heading_rad"))
+    places = [np.interp(time, table["time_s"], line) for line in poses]
     moves = [signal.at(time) for signal in (measured.vx, measured.vy, measured.yaw_rate)]
     known = np.all(np.isfinite([*places, *moves]), axis=0)
     parts: list[Any] = [part[known] for part in (*places, *moves)]
@@ -43,9 +47,12 @@ def samples_of(run: Run) -> Sample:
 
 def judge_run(run: Run, course: Course | None, laps: int = 1) -> tuple[Score, dict[str, Any]]:
     """The score of a run on a course, and the JSON of it as `drive` prints it."""
-    task = Task.of(course, laps)
+    task = dataclasses.replace(Task.of(course, laps), of_log=True)
     score, _ = task.follow(task.init(), samples_of(run))
     outcome = Outcome.of(score.outcome)
     if outcome == Outcome.DRIVING:
-        outcome = Outcome.DONE if task.line is None else Outcome.LATE
+        # A log may end at its goal, before anything shows that the last turn has ended.
+        reached = np.isfinite(score.goal_time)
+        outcome = Outcome.REACHED if reached else Outcome.LATE
+        outcome = Outcome.DONE if task.line is None else outcome
     return score, summary(score, outcome)

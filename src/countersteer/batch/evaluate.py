@@ -105,8 +105,10 @@ def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
     """What came of a driver's trials; names and units are those of the JSON."""
     won, turns = score.outcome == Outcome.REACHED.code, score.turns
     count, trials = int(np.sum(won)), len(seeds)
-    drifts = np.all(turns.peak_sideslip > DRIFT, axis=1)
-    errors = np.degrees(turns.error[won])
+    begun = np.isfinite(turns.begin)  # a bend may be rounded without a turn of its own
+    drifts = np.all((turns.peak_sideslip > DRIFT) | ~begun, axis=1)
+    counted = begun & won[:, None]
+    errors = np.degrees(turns.error[counted])
     numbers = np.asarray(seeds)
 
     def median(values: np.ndarray) -> float | None:
@@ -119,9 +121,9 @@ def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
         "success_interval": list(interval(count, trials)),
         "drift_share": float(np.mean(drifts[won])) if count else None,
         "heading_error_rms_deg": float(np.sqrt(np.mean(errors**2))) if errors.size else None,
-        "peak_sideslip_deg_median": median(np.degrees(turns.peak_sideslip[won])),
-        **overshoot(np.degrees(turns.overshoot[won])),
-        "entry_speed_mps_median": median(turns.entry_speed[won]),
+        "peak_sideslip_deg_median": median(np.degrees(turns.peak_sideslip[counted])),
+        **overshoot(np.degrees(turns.overshoot[counted])),
+        "entry_speed_mps_median": median(turns.entry_speed[counted]),
         "lap_time_s_median": median(score.goal_time[won]),
         "failed_seeds": [int(seed) for seed in numbers[~won]],
         "failures": {
@@ -179,10 +181,11 @@ def picture(scores: Mapping[str, Score], title: str, path: Path) -> None:
         won, turns = score.outcome == Outcome.REACHED.code, score.turns
         if not np.any(won):
             continue
+        counted = won[:, None] & np.isfinite(turns.begin)
         drawn = {"histtype": "step", "linewidth": 1.5, "label": name}
         for axes, values, bins in (
-            (errors, np.degrees(turns.error[won]).ravel(), np.linspace(-10, 10, 41)),
-            (slips, np.degrees(turns.peak_sideslip[won]).ravel(), np.linspace(0, 70, 36)),
+            (errors, np.degrees(turns.error[counted]), np.linspace(-10, 10, 41)),
+            (slips, np.degrees(turns.peak_sideslip[counted]), np.linspace(0, 70, 36)),
         ):
             axes.hist(np.clip(values, bins[0], bins[-1]), bins=bins, **drawn)
         laps.hist(score.goal_time[won], bins=40, **drawn)

@@ -109,7 +109,7 @@ def drawn_alone(options: argparse.Namespace, course: "Course", car: "Car") -> tu
     from countersteer.batch.population import draw, load_population
 
     drawn = draw(
-        load_population(options.cars), car, course, [options.seed], np.float32, options.speed_mps
+        load_population(options.cars), car, course, [options.seed], np.float64, options.speed_mps
     )
     speed = None if drawn.speed is None else float(drawn.speed[0])
     x, y, heading = (float(value) for value in drawn.pose[0])

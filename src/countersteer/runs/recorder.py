@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -72,6 +73,12 @@ def _numbered(parent: Path, name: str) -> Path:
             raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
 
 
+def _due(tick: np.ndarray, before: np.ndarray, every: int) -> np.ndarray:
+    """Where a multiple of so many ticks has been reached since the frame before."""
+    due: np.ndarray = tick // every > before // every
+    return due
+
+
 class Recorder:
     """A folder with `run.toml`, tables that grow, and `run.mcap`; flushed with every piece.
 
@@ -92,7 +99,7 @@ class Recorder:
         """
         self.folder = folder
         self._channels, self._pace = channels, pace
-        self._told = -1  # tick of the last row of telemetry
+        self._last = self._newest = self._told = -1  # ticks: frame, reading, row of telemetry
         if channels is not None:
             told = [column for channel in flat(channels) for column in channel.columns]
             truth = ("time_s", *(channel.name for channel in TRUTH))
@@ -112,24 +119,33 @@ class Recorder:
         assert self._pace is not None, "frames need a pace"
         pace, tick = self._pace, np.asarray(frames.tick)
         time, told = tick * pace.dt, [*pairs(self._channels, frames.readings)]
-        rows = tick % pace.telemetry == 0
+        before = np.concatenate([[self._last], tick[:-1]])
+        rows = _due(tick, before, pace.telemetry)
         if pace.onboard:
-            for _, reading in told:
-                rows |= (np.asarray(reading.tick) == tick) & (tick > 0)
+            newest = np.maximum.accumulate(
+                np.max([np.asarray(reading.tick) for _, reading in told], axis=0)
+            )
+            rows |= newest > np.maximum(np.concatenate([[self._newest], newest[:-1]]), 0)
+            self._newest = max(self._newest, int(newest[-1]))
         rows = np.nonzero(rows)[0]
-        before = np.concatenate([[self._told], tick[rows]])
+        since = np.maximum(np.concatenate([[self._told], tick[rows]])[:-1], 0)
         telemetry = [time[rows]]
-        for _, reading in told:
-            new = np.asarray(reading.tick)[rows] > np.maximum(before[:-1], 0)
-            values = np.asarray(reading.value)[rows].reshape(len(rows), -1)  # a column each
+        for channel, reading in told:
+            new = np.asarray(reading.tick)[rows] > since
+            width = max(1, math.prod(channel.shape))
+            values = np.asarray(reading.value)[rows].reshape(len(rows), width)  # a column each
             telemetry.extend(np.where(new[:, None], values, np.nan).T)
-        self._told = int(before[-1])
-        fresh, command = np.nonzero(frames.fresh)[0], frames.command
+        if len(rows):
+            self._told = int(tick[rows[-1]])
+        command = [np.asarray(part) for part in frames.command]
+        # A command that is no number is none that a car can run.
+        fresh = np.nonzero(np.asarray(frames.fresh) & np.isfinite(command[0] + command[1]))[0]
         tables = {
-            "commands": tuple(np.asarray(c)[fresh] for c in (time, *command)),
+            "commands": tuple(part[fresh] for part in (time, *command)),
             "telemetry": telemetry,
         }
-        shown = np.nonzero(tick % pace.truth == 0)[0]
+        shown = np.nonzero(_due(tick, before, pace.truth))[0]
+        self._last = int(tick[-1]) if len(tick) else self._last
         if frames.truth is not None:
             tables["truth"] = [np.asarray(column)[shown] for column in (time, *frames.truth)]
         self.write(tables)

@@ -88,6 +88,7 @@ class Task:
 
     A drive that has reached its goal goes on until the turn that it is in, if any, has ended.
     Where `walls_end` it ends with the first touch of a wall. Without a goal it ends when it must.
+    One `of_log` may rest as long as it likes, and its place is found again after a gap.
     """
 
     line: Line | None  # the centre line; None: there is no goal
@@ -95,6 +96,7 @@ class Task:
     goal: Scalar  # m
     corners: Corners
     walls_end: bool = dataclasses.field(default=False, metadata={"static": True})
+    of_log: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @classmethod
     def of(
@@ -125,9 +127,10 @@ class Task:
     def update(self, score: Score, sample: Sample) -> Score:
         """The score with one sample more; a drive that is over stays as it is."""
         time, motion = sample.time, sample.motion
-        distance = score.distance
+        distance, finite = score.distance, jnp.isfinite(motion.x + motion.vx + motion.yaw_rate)
         if self.line is not None:
-            distance = self.line.follow(motion.x, motion.y, distance).distance
+            follow = self.line.find if self.of_log else self.line.follow
+            distance = follow(motion.x, motion.y, distance).distance
         ahead = distance > score.furthest + STEP
         reached = jnp.isinf(score.goal_time) & (distance >= self.goal - 1e-9)
         goal_time = jnp.where(reached, time, score.goal_time)
@@ -136,6 +139,7 @@ class Task:
         speed = jnp.sqrt(motion.vx**2 + motion.vy**2)
         seen = turning.approached(score.approach, distance, speed)
         turns = turning.follow(score.turns, self.corners, seen, distance, motion, time)
+        turns = jax.tree.map(lambda a, b: jnp.where(finite, a, b), turns, score.turns)
         handed = jnp.arange(len(score.handover)) < sample.turn
         handover = jnp.where(handed & jnp.isinf(score.handover), time, score.handover)
         over = ~jnp.isinf(goal_time) & (
@@ -144,11 +148,11 @@ class Task:
         stalled = jnp.isinf(goal_time) & (time - furthest_at > STALLED)
         outcome = jnp.int32(Outcome.DRIVING.code)
         for found, name in (
-            (stalled & (self.line is not None), Outcome.STALLED.code),
+            (stalled & (self.line is not None and not self.of_log), Outcome.STALLED.code),
             (over, Outcome.REACHED.code),
             (sample.rolled_over > 0, Outcome.ROLLED.code),
             (self.walls_end & (sample.wall_contacts > 0), Outcome.TOUCHED.code),
-            (~jnp.isfinite(motion.x + motion.vx + motion.yaw_rate), Outcome.LOST.code),
+            (~finite, Outcome.LOST.code),
         ):
             outcome = jnp.where(found, jnp.int32(name), outcome)
         new = Score(
@@ -198,7 +202,7 @@ def summary(score: Score, outcome: Outcome) -> dict[str, Any]:
     return {
         "completed": completed,
         "success": completed and contacts == 0,
-        "status": outcome.value,
+        "outcome": outcome.value,
         "wall_contacts": contacts,
         "lap_time_s": float(score.goal_time) if np.isfinite(score.goal_time) else None,
         "turns": [

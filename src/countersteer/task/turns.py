@@ -1,6 +1,6 @@
 """The turns of a drive, found from motion and course alone: whoever drives is judged alike.
 
-Turn k begins when the heading passes 15° into corner k, counted from the corridor before it, while
+Turn k begins when the heading is first 15° into corner k, counted from the corridor before it, and
 the car is near that corner: within `NEAR` corridor widths of its arc, and of no corner nearer. It
 ends when yaw rate and sideslip have been under 30 °/s and 10° for 50 ms, having been above in it;
 at the latest after 2 s, or as the next turn begins. A spin on a straight is no turn, and a car that
@@ -34,7 +34,7 @@ MARKS = round(BEFORE / MARK) + 2
 class Corners(NamedTuple):
     """The corners between start and goal: arrays of one number a corner."""
 
-    before: Array  # bearing of the corridor before it, rad; unwrapped from the start's
+    before: Array  # bearing of the corridor before it, rad; whole turns do not matter
     angle: Array  # by which it turns, positive to the left
     near: Array  # distances along the line between which a car is near it, m
     far: Array
@@ -44,7 +44,7 @@ class Approach(NamedTuple):
     """Speeds at the last places along the line, `MARK` apart; place i is kept in slot i % MARKS."""
 
     speed: Array  # (MARKS,) m/s
-    last: Scalar  # number of the furthest place
+    last: Scalar  # number of the last place
 
 
 class Turns(NamedTuple):
@@ -105,7 +105,15 @@ def corners_of(course: Course, laps: int, dtype: Any) -> Corners:
     reach = NEAR * (course.width or 1.0) + np.array([abs(t.angle) * t.radius / 2 for t in turns])
     middles = (places[1:] + places[:-1]) / 2
     ends = np.concatenate([[-np.inf], middles, [np.inf]]) if turns else np.zeros(1)
-    before = course.start[2] + np.cumsum(angles) - angles
+    # The bearing of the corridor before a corner is the first one's, and all corners between. That
+    # of the start is the car's own: it may stand turned.
+    own = np.array([turn.distance for turn in course.turns])
+    bent = np.array([turn.angle for turn in course.turns])
+    bearings = math.atan2(*(course.line[1] - course.line[0])[::-1]) + np.cumsum(bent) - bent
+    # Of the corners of all rounds, those ahead are some in a row.
+    off = (own - places[0]) / course.length if len(turns) else np.zeros(1)
+    first = int(np.argmin(np.abs(off - np.round(off) if course.closed else off)))
+    before = bearings[(first + np.arange(len(turns))) % max(len(own), 1)]
     nearest = np.maximum(ends[:-1], places - reach), np.minimum(ends[1:], places + reach)
     return Corners(*(np.asarray(column, dtype) for column in (before, angles, *nearest)))
 
@@ -122,7 +130,7 @@ def approached(old: Approach, distance: Scalar, speed: Scalar) -> Approach:
     """The speeds with one sample more."""
     here = jnp.floor(distance / MARK).astype(jnp.int32)
     places = here - (here - jnp.arange(MARKS)) % MARKS  # that the slots are of by now
-    return Approach(jnp.where(places > old.last, speed, old.speed), jnp.maximum(old.last, here))
+    return Approach(jnp.where(places > old.last, speed, old.speed), here)
 
 
 def speed_before(seen: Approach, distance: Scalar) -> Scalar:
@@ -147,11 +155,12 @@ def follow(
     back = jnp.isinf(old.begin) & (hand * (off - spun) < INTO - whole)
     spun = jnp.where(back, spun - hand * whole, spun)
     into = hand * (off - spun)
-    # What goes too far in one turn is not into the next of the same hand.
+    # What goes too far in one turn, and comes back, is not into the next of the same hand.
     in_turn = (old.begin <= time) & jnp.isinf(old.end)
     same = jnp.any(in_turn & (hand == hand[:, None]), axis=1)
     passes = (old.into < INTO) & (into - old.into < math.pi)
-    begins = jnp.isinf(old.begin) & near & (into >= INTO) & (passes | ~same)
+    goes_on = hand * motion.yaw_rate > STRAIGHT_RATE
+    begins = jnp.isinf(old.begin) & near & (into >= INTO) & (passes | ~same | goes_on)
     begin = jnp.where(begins, time, old.begin)
     under_way = (begin <= time) & jnp.isinf(old.end)
     stirred = jnp.where(under_way & ~calm, 1.0, old.stirred)

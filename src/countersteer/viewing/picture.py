@@ -102,7 +102,7 @@ def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
 def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: float) -> None:
     """Write across the top what was driven and how it ended."""
     summary = view["summary"]
-    status = str(summary["status"])
+    status = str(summary["outcome"])
     figure.text(0.022, 0.955, str(view["title"]), color=INK, size=18, weight="bold", va="center")
     said = status[:1].upper() + status[1:]
     mood = _GOOD if summary["completed"] else _BAD

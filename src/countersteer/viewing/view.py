@@ -17,13 +17,18 @@ from countersteer.world.floor import Floor, floor_of_run
 
 PERIOD = 0.01  # s between two samples, at least
 ROWS = 1024  # whose forces are computed at once: always as many, so that there is one program
+UNJUDGED = {"outcome": "not judged", "completed": False, "wall_contacts": 0, "turns": []}
 WHEELS = ("fl", "fr", "rl", "rr")
+MOTION = ("vx_mps", "vy_mps", "yaw_rate_radps", "steering_rad")
 
 
 def view_of(run: Run) -> dict[str, Any]:
     """Plain lists, units in the names. Raises `InputError` where the run has no poses."""
     if run.truth is None or len(run.truth) == 0:
         raise InputError(f"{run.path}: has no truth.csv to draw")
+    for name in (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS)):
+        if name not in run.truth:
+            raise InputError(f"{run.path}/truth.csv: has no {name}: this page is of simulated runs")
     truth, about, car = run.truth, run.about, drawn_car(run.about)
     time = truth["time_s"]
     period = float(np.median(np.diff(time))) if len(time) > 1 else PERIOD
@@ -41,8 +46,9 @@ def view_of(run: Run) -> dict[str, Any]:
     place = about.get("course", {}).get("name", "open floor")
     body, tires = car.body, planar.tires_by_wheel(car)
     return {
-        "title": f"{place}, {about['driver']}, {about['car_name']}, seed {about['seed']}",
-        "summary": run.summary,
+        "title": f"{place}, {about.get('driver')}, {about.get('car_name')}, "
+        f"seed {about.get('seed')}",
+        "summary": UNJUDGED | run.summary,
         "walls_m": about.get("course", {}).get("walls_m", []),
         "car": {
             "length_m": float(body.length),
