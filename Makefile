@@ -11,7 +11,7 @@ drive: $(READY)
 	$(BIN)/countersteer drive box
 
 test: $(READY)
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadfile
 
 check: $(READY)
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """What the tests share: 64-bit floats, JAX's cache on disk, and programs that compile once."""
 
+import gc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -40,6 +41,14 @@ keep_programs()  # before anything computes: it sets how to compile
 def session() -> Iterator[None]:
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs() -> Iterator[None]:
+    """Each file's compiled programs go with it: hundreds in one process have crashed XLA 0.10.2."""
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 class Drive(NamedTuple):
