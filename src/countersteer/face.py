@@ -110,7 +110,7 @@ def drive(
     told of. `speed` in m/s, `battery` is the charge from 0 to 1, `dt` in seconds. The run's folder
     is `out`, or a new one under `runs/`. Raises `InputError` with one line where an input is wrong.
     """
-    keep_programs(batches=False)
+    keep_programs(batches=False, cores=2)
     where, simulated = load_course(course), load_car(car, set)
     if link not in LINKS:
         raise InputError(f"link: one of {', '.join(LINKS)}, not {link}")

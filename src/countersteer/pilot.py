@@ -126,14 +126,10 @@ class Pilot:
 
     def init(self, root: jax.Array) -> Memory:
         """Before the first decision; `root` is the drive's key (`streams.root`)."""
+        if isinstance(root, jax.core.Tracer):
+            return _init(self, root)
         with jax.enable_x64(self.dtype == np.float64):
-            estimate = self.estimator.init(streams.key(root, Stream.ESTIMATOR))
-            memory = self.driver.reset(streams.key(root, Stream.DRIVER))
-            dtype = jnp.result_type(self.estimator.estimate(estimate).x)
-            if self.traced:
-                memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
-            zero = dtype.type(0)
-            return Memory(estimate, memory, Command(zero, zero))
+            return _compiled_init(self, root) if self.traced else _init(self, root)
 
     def act(self, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Command, Memory]:
         """The command from this tick on, and the memory after it.
@@ -183,6 +179,16 @@ class Pilot:
         return status_of(self.driver, memory.driver)
 
 
+def _init(pilot: Pilot, root: jax.Array) -> Memory:
+    estimate = pilot.estimator.init(streams.key(root, Stream.ESTIMATOR))
+    memory = pilot.driver.reset(streams.key(root, Stream.DRIVER))
+    dtype = jnp.result_type(pilot.estimator.estimate(estimate).x)
+    if pilot.traced:
+        memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
+    zero = dtype.type(0)
+    return Memory(estimate, memory, Command(zero, zero))
+
+
 def _act(pilot: Pilot, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Command, Memory]:
     estimate, observation = pilot.observe(memory, readings, tick)
     command, own = pilot.driver.act(memory.driver, observation)
@@ -194,7 +200,8 @@ def _act(pilot: Pilot, memory: Memory, readings: Readings, tick: Scalar) -> tupl
     return after.command, after
 
 
-_compiled_act, _compiled_observe = jax.jit(_act), jax.jit(Pilot.observe)
+_compiled_init, _compiled_act = jax.jit(_init), jax.jit(_act)
+_compiled_observe = jax.jit(Pilot.observe)
 
 
 @jax.jit

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from countersteer.recording import Drive
 
 
+TRACED = 0.9  # s by when the loop has been traced, which needs Python, and is being compiled
+
+
 def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
     from countersteer.recording import drive
@@ -23,10 +26,10 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     from countersteer.viewing.report import report_html
     from countersteer.viewing.view import view_of
 
-    keep_programs(batches=False)
+    keep_programs(batches=False, cores=2)
     folder = new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}")
     painter = Painter(folder / "report.png")
-    beside = threading.Thread(target=prepare_the_rest, args=(what,))
+    beside = threading.Timer(TRACED, prepare_the_rest, args=(what,))
     beside.start()
     with Progress(options.json) as progress:
         result = drive(what, folder, progress.show)

@@ -180,7 +180,8 @@ class Task:
 
         Leaves of `samples` have an axis of samples in front; they are taken in 64 bits.
         """
-        with jax.enable_x64(True):
+        # Where there is another device, a loop that is being computed is not waited for.
+        with jax.enable_x64(True), jax.default_device(jax.devices()[-1]):
             wide = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), samples)
             score, outcomes = _follow(self, score, wide)
             return jax.tree.map(np.asarray, score), np.asarray(outcomes)
