@@ -14,8 +14,9 @@ from conftest import stacked, varied
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
-from countersteer.estimation import dead_reckoning, pose, spikes, velocity
+from countersteer.estimation import dead_reckoning, pose, spikes
 from countersteer.estimation.estimate import Estimate
+from countersteer.estimation.velocity import filter as velocity_filter
 from countersteer.estimation.wall_angle import wall_angle
 from countersteer.pilot import Pilot
 from countersteer.sensing.sonar import distances, edges
@@ -102,7 +103,9 @@ def drives() -> Drives:
 @jax.jit
 def filtered(nominal, readings, command, ticks):
     """The estimates of both filters after every step, (steps, cars)."""
-    first = velocity.initial_memory(nominal, COURSE.start, SINGLE)._replace(tick=jnp.int32(0))
+    first = velocity_filter.initial_memory(nominal, COURSE.start, SINGLE)._replace(
+        tick=jnp.int32(0)
+    )
     axes = jax.tree.map(lambda _: 0, first)._replace(tick=None)
     wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (CARS, *jnp.shape(leaf))), first)
     reckoned = dead_reckoning.initial_memory(COURSE.start, SINGLE)
@@ -112,10 +115,10 @@ def filtered(nominal, readings, command, ticks):
         memory, reckoned = memories
         readings, command, tick = now
         memory = jax.vmap(
-            lambda m, r, c: velocity.update(nominal, m, r, c, tick, DT), (axes, 0, 0), axes
+            lambda m, r, c: velocity_filter.update(nominal, m, r, c, tick, DT), (axes, 0, 0), axes
         )(memory, readings, command)
         reckoned = jax.vmap(lambda m, r: dead_reckoning.update(m, r, DT))(reckoned, readings)
-        estimate = jax.vmap(lambda m: velocity.estimate(nominal, m, DT), (axes,))(memory)
+        estimate = jax.vmap(lambda m: velocity_filter.estimate(nominal, m, DT), (axes,))(memory)
         reckoned = jax.tree.map(lambda new, old: new.astype(old.dtype), reckoned, memories[1])
         return (memory, reckoned), (estimate, reckoned.estimate)
 

@@ -9,7 +9,7 @@ from countersteer.course.course import Course
 from countersteer.estimation.dead_reckoning import DeadReckoning
 from countersteer.estimation.estimator import Estimator, Truth
 from countersteer.estimation.pose import PoseEstimator, PoseFilter
-from countersteer.estimation.velocity import VelocityFilter
+from countersteer.estimation.velocity.filter import VelocityFilter
 from countersteer.world.walls import padded
 
 Make = Callable[[Course | None, Car, float], Estimator]

@@ -15,9 +15,9 @@ import numpy as np
 from countersteer.car.car import Sonar
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
-from countersteer.estimation import velocity
 from countersteer.estimation.estimate import Estimate
-from countersteer.estimation.velocity import VelocityFilter
+from countersteer.estimation.velocity.filter import VelocityFilter
+from countersteer.estimation.velocity.states import VelocityMemory
 from countersteer.sensing.sonar import MERGED
 from countersteer.signals import Array, Command, Reading, Readings, Scalar
 from countersteer.world.chassis import Symmetric
@@ -252,7 +252,7 @@ class PoseEstimator:
         """Ticks between two steps of the cloud, at least."""
         return max(1, round(PERIOD / self.moving.dt))
 
-    def init(self, key: jax.Array) -> tuple[velocity.Memory, Located]:
+    def init(self, key: jax.Array) -> tuple[VelocityMemory, Located]:
         """At rest, with the cloud around the start."""
         memory = self.moving.init(key)
         known = self.moving.estimate(memory)
@@ -261,11 +261,11 @@ class PoseEstimator:
 
     def update(
         self,
-        memory: tuple[velocity.Memory, Located],
+        memory: tuple[VelocityMemory, Located],
         readings: Readings,
         command: Command,
         tick: Scalar,
-    ) -> tuple[velocity.Memory, Located]:
+    ) -> tuple[VelocityMemory, Located]:
         """Both filters at `tick`; the cloud steps when it is due."""
         moves = self.moving.update(memory[0], readings, command, tick)
         known = self.moving.estimate(moves)
@@ -280,7 +280,7 @@ class PoseEstimator:
         place = jax.lax.cond(since >= self.every, step, lambda same: same, memory[1])
         return moves, place
 
-    def estimate(self, memory: tuple[velocity.Memory, Located]) -> Estimate:
+    def estimate(self, memory: tuple[VelocityMemory, Located]) -> Estimate:
         """The velocity filter's, with the pose of the best hypothesis."""
         return located(memory[1], self.moving.estimate(memory[0]))
 

@@ -1,0 +1,1 @@
+"""The car's velocity from gyroscope, accelerometer and encoder; `filter.py` is where to start."""
