@@ -16,13 +16,14 @@ from scipy.ndimage import gaussian_filter1d
 from countersteer.car.car import GRAVITY, Car, Tire
 from countersteer.car.files import load_car
 from countersteer.car.parameter import pytree
+from countersteer.compiling import configure_jax
 from countersteer.course.course import Course, progress
 from countersteer.course.files import load_course
 from countersteer.drivers.driver import Observation
 from countersteer.errors import InputError
 from countersteer.pilot import Pilot
 from countersteer.signals import Array, Command, Scalar
-from countersteer.simulator import Simulator, keep_programs
+from countersteer.simulator import Simulator
 from countersteer.world import motor
 
 POINTS = 1024  # of the line: always as many, so that all tracks share a compiled program
@@ -198,7 +199,7 @@ def main() -> None:
     parser.add_argument("--car", default="jetracer")
     parser.add_argument("--grip", type=float, default=0.85, help="part of it that is used")
     options = parser.parse_args()
-    keep_programs(batches=False)
+    configure_jax(batches=False)
     try:
         times, contacts = lap_times(
             load_course(options.course), load_car(options.car), options.laps, options.grip

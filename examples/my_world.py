@@ -7,11 +7,12 @@ import jax.numpy as jnp
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.car.parameter import pytree
+from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
 from countersteer.drivers.straighten import straighten
 from countersteer.pilot import Pilot
 from countersteer.signals import Command, Motion, Scalar, Wheels
-from countersteer.simulator import Simulator, keep_programs
+from countersteer.simulator import Simulator
 from countersteer.world.world import Events
 
 
@@ -50,7 +51,7 @@ class Kinematic:
 
 
 if __name__ == "__main__":
-    keep_programs(batches=False)
+    configure_jax(batches=False)
     course, car = load_course("straight"), load_car("rx7")
     pilot = Pilot.of(straighten(course, car), course, car)
     world = lambda car, walls, floor, dt: Kinematic(car=car, dt=dt)  # noqa: E731  # one line

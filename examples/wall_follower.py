@@ -3,12 +3,13 @@
 import sys
 
 from countersteer.car.files import load_car
+from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
 from countersteer.drivers.driver import Observation
 from countersteer.errors import InputError
 from countersteer.pilot import Pilot
 from countersteer.signals import Command
-from countersteer.simulator import Simulator, keep_programs
+from countersteer.simulator import Simulator
 
 
 class WallFollower:
@@ -31,7 +32,7 @@ class WallFollower:
 
 
 if __name__ == "__main__":
-    keep_programs(batches=False)  # what JAX compiles is kept: the second start takes no time
+    configure_jax(batches=False)  # what JAX compiles is kept: the second start takes no time
     course, car = load_course("straight"), load_car("rx7")
     pilot, simulator = Pilot.of(WallFollower(), course, car), Simulator.of(course, car)
     print("the first start compiles for some seconds", flush=True)

@@ -22,6 +22,7 @@ from countersteer.batch.evaluate import Trials, interval, results
 from countersteer.batch.population import Drawn, draw, load_population
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
+from countersteer.compiling import configure_jax
 from countersteer.course.course import Course
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
@@ -30,7 +31,6 @@ from countersteer.drivers.straighten import lane, straighten
 from countersteer.estimation.pose import PoseFilter
 from countersteer.link.link import ONBOARD
 from countersteer.sensing.faults import KINDS, Fault
-from countersteer.simulator import keep_programs
 from countersteer.task.task import PERIOD, Outcome, Score
 from countersteer.world import battery
 from countersteer.world.walls import padded
@@ -76,7 +76,7 @@ def errors(course: Course, car: Car, seeds: Sequence[int], make: Make = drift_tu
     lines = jax.tree.map(np.float32, lane(course))
     sonar = jax.tree.map(np.float32, car.sensors.sonar)
     watch = Errors(lane=lines, sonar=sonar, inside=np.float32(chi2.ppf(0.95, 3)))
-    return trials(course, car, seeds).watched(partial(make, course, car), watch)
+    return trials(course, car, seeds).run_watched(partial(make, course, car), watch)
 
 
 def figures(of: Trials, kept: Any) -> dict[str, float]:
@@ -240,7 +240,7 @@ def settled(course: Course, car: Car, seeds: Sequence[int]) -> tuple[Any, np.nda
         turns=(np.arange(alike) * 2 * math.pi / alike).astype(np.float32),
     )
     make = partial(drift_turn, course, car)
-    score, placed = trials(course, car, seeds).watched(make, watch, lanes=len(seeds) // 2)
+    score, placed = trials(course, car, seeds).run_watched(make, watch, lanes=len(seeds) // 2)
     return placed, np.isfinite(score.turns.end[:, 1])
 
 
@@ -261,7 +261,7 @@ def failing(
             for i, (s, k) in enumerate(pairs)
         )
         own = trials(course, car, seeds.tolist())
-        return own.watched(partial(drift_turn, course, car), None, faults=faults)[0]
+        return own.run_watched(partial(drift_turn, course, car), None, faults=faults)[0]
 
     seeds = np.arange(cars)
     none = np.full(cars, -1)
@@ -498,5 +498,5 @@ def write(page: Path, name: str = "rx7", cars: int = CARS) -> None:
 
 
 if __name__ == "__main__":
-    keep_programs(blocks=True, cores=2)
+    configure_jax(blocks=True, cores=2)
     write(Path(sys.argv[1]), cars=int(sys.argv[2]) if len(sys.argv) > 2 else CARS)

@@ -17,8 +17,8 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
+from countersteer.compiling import configure_jax
 from countersteer.runs.run import read_run
-from countersteer.simulator import keep_programs
 from countersteer.tuning import fit, tune
 from countersteer.tuning.compare import compare
 from countersteer.tuning.windows import QUANTITIES
@@ -137,7 +137,7 @@ def read(base: str, paths: Sequence[Path]) -> tuple[tune.Logs, dict[str, Car]]:
 def main(arguments: Sequence[str]) -> Any:
     """The command."""
     out, base, *paths = arguments
-    keep_programs(blocks=True)
+    configure_jax(blocks=True)
     with jax.enable_x64(True):
         logs, cars = read(base, [Path(path) for path in paths])
         found = cross_validate(logs, cars, Path(base).stem, lambda text: print(text, flush=True))

@@ -20,12 +20,13 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
+from countersteer.compiling import configure_jax
 from countersteer.drivers.replay import Replay
 from countersteer.pilot import Pilot
 from countersteer.recording import Drive, about_run, drive
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run, read_run
-from countersteer.simulator import Simulator, keep_programs
+from countersteer.simulator import Simulator
 from countersteer.tuning import fit
 from countersteer.tuning.tune import read_logs
 from countersteer.tuning.windows import ENCODER_LAG
@@ -149,7 +150,7 @@ def page(cases: Sequence[Case], cars: int, what: str) -> str:
 
 
 if __name__ == "__main__":
-    keep_programs(blocks=True)
+    configure_jax(blocks=True)
     count = int(sys.argv[2]) if len(sys.argv) > 2 else CARS
     what = sys.argv[3] if len(sys.argv) > 3 else "all"
     found: list[Case] = []

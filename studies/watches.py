@@ -1,6 +1,6 @@
 """What is looked at beside the judge while trials run: errors of the estimates, and the pose.
 
-Each is a `rollout.Watch`. Sums are kept, not records, so that thousands of trials fit.
+Each is a `trials.Watch`. Sums are kept, not records, so that thousands of trials fit.
 """
 
 import dataclasses
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer import streams
+from countersteer.batch.trials import Instant
 from countersteer.car.car import Sonar
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
@@ -19,11 +20,10 @@ from countersteer.drivers.drift_turn import STRAIGHT
 from countersteer.drivers.straighten import Lane
 from countersteer.estimation import dead_reckoning, pose, spikes
 from countersteer.estimation.estimate import Estimate
-from countersteer.pilot import Memory, Pilot
 from countersteer.signals import Array, Scalar
-from countersteer.simulator import Loop, Simulator, heard
+from countersteer.simulator import heard
 from countersteer.streams import Stream
-from countersteer.task.task import PERIOD, Score
+from countersteer.task.task import PERIOD
 from countersteer.world.chassis import Vector, dot, solve
 
 SLIPS = math.radians(10)  # sideslip from which on the car drifts
@@ -59,8 +59,8 @@ class Kept(NamedTuple):
     passed: Scalar  # of these believed by `spikes`
     estimate: Estimate  # the last
     charge: Scalar
-    reckoning: dead_reckoning.Memory
-    spike: spikes.Memory
+    reckoning: dead_reckoning.ReckoningMemory
+    spike: spikes.SpikeMemory
     sound: Scalar  # whether the ping at the last look was
 
 
@@ -72,10 +72,9 @@ class Errors:
     sonar: Sonar  # the nominal car's
     inside: Scalar  # 95 % of a chi-squared distribution with three degrees of freedom
 
-    def begin(self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory) -> Kept:
+    def begin(self, now: Instant) -> Kept:
         """Nothing yet."""
-        del pilot, memory
-        m = simulator.world.motion(loop.state)
+        m = now.simulator.world.motion(now.loop.state)
         dtype = jnp.result_type(m.x)
         zero = jnp.zeros((), dtype)
         told = jax.tree.map(lambda _: zero, Estimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -88,19 +87,10 @@ class Errors:
             spike=spikes.initial_memory(np.dtype(dtype)),
         )
 
-    def look(
-        self,
-        simulator: Simulator,
-        pilot: Pilot,
-        loop: Loop,
-        memory: Memory,
-        score: Score,
-        kept: Kept,
-    ) -> Kept:
+    def look(self, now: Instant, kept: Kept) -> Kept:
         """One instant more."""
-        del score
-        motion, dt = simulator.world.motion(loop.state), simulator.dt
-        _, seen = pilot.observe(memory, heard(simulator, loop), loop.tick)
+        motion, dt = now.simulator.world.motion(now.loop.state), now.simulator.dt
+        _, seen = now.pilot.observe(now.memory, heard(now.simulator, now.loop), now.loop.tick)
         told = jax.tree.map(lambda value: jnp.asarray(value, motion.charge.dtype), seen.estimate)
         time = seen.time
         warm = time > WARM
@@ -108,7 +98,7 @@ class Errors:
         slip = jnp.arctan2(motion.vy, motion.vx)
         fast = motion.vx**2 + motion.vy**2 > FASTER**2
         drifts = jnp.where(warm & fast & (jnp.abs(slip) > SLIPS), 1.0, 0.0)
-        reckoning = dead_reckoning.update(kept.reckoning, loop.readings, dt)
+        reckoning = dead_reckoning.update(kept.reckoning, now.loop.readings, dt)
 
         def square(other: Estimate) -> Scalar:
             off = other.sideslip - slip
@@ -117,20 +107,20 @@ class Errors:
         off = Vector(told.vx - motion.vx, told.vy - motion.vy, told.yaw_rate - motion.yaw_rate)
         normal = dot(off, solve(told.velocity_covariance, off))
         looked = jnp.where(warm, 1.0, 0.0)
-        number = loop.tick // round(PERIOD / dt)
+        number = now.loop.tick // round(PERIOD / dt)
         place = jnp.minimum(number // SAMPLE, SAMPLES - 1)
         fills = warm & (number % SAMPLE == 0)
         squares = kept.squares.at[place].set(jnp.where(fills, normal, kept.squares[place]))
 
-        own = pilot.status(memory)
+        own = now.pilot.status(now.memory)
         offset, angle, _ = self.lane.place(jnp.asarray(own.turn), motion)
         goes_on = own.phase == STRAIGHT
         straight = jnp.where(warm & goes_on & (jnp.abs(angle) < 0.3), 1.0, 0.0)
         offset_error, angle_error = (own.offset - offset) ** 2, (own.angle - angle) ** 2
         variances = (own.offset_deviation**2, own.angle_deviation**2)
 
-        front = loop.readings.sonar[0]
-        expected = pose.PoseFilter(walls=simulator.walls, sonar=self.sonar).expected(
+        front = now.loop.readings.sonar[0]
+        expected = pose.PoseFilter(walls=now.simulator.walls, sonar=self.sonar).expected(
             *(jnp.reshape(value, (1,)) for value in (motion.x, motion.y, motion.heading))
         )[0][0]
         came = (front.tick > kept.spike.tick) & jnp.isfinite(front.value) & warm
@@ -202,39 +192,31 @@ class Places:
     turns: Array  # (places,) rad
     particles: int = dataclasses.field(default=PARTICLES, metadata={"static": True})
 
-    def begin(
-        self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory
-    ) -> tuple[pose.Memory, Placed]:
+    def begin(self, now: Instant) -> tuple[pose.Cloud, Placed]:
         """Anywhere; each trial with noise of its own."""
-        motion = simulator.world.motion(loop.state)
+        motion = now.simulator.world.motion(now.loop.state)
         zero = jnp.zeros_like(motion.x)
         still = Estimate(zero, zero, motion.heading, zero, zero, zero)
-        key, own = jax.random.split(streams.key(simulator.root, Stream.WATCH))
+        key, own = jax.random.split(streams.key(now.simulator.root, Stream.WATCH))
         none = jnp.full_like(self.turns, jnp.inf)
-        still = still._replace(heading=pilot.estimator.estimate(memory.estimate).heading)
+        still = still._replace(heading=now.pilot.estimator.estimate(now.memory.estimate).heading)
         picked = jax.random.randint(own, (self.particles,), 0, len(self.uniform[0]))
         x, y, heading = (jnp.asarray(value)[picked] for value in self.uniform)
         cloud = self.place.memory(x, y, heading, _slim(still), key)
         return cloud, Placed(none, none, zero, zero + jnp.inf)
 
-    def look(
-        self,
-        simulator: Simulator,
-        pilot: Pilot,
-        loop: Loop,
-        memory: Memory,
-        score: Score,
-        kept: tuple[pose.Memory, Placed],
-    ) -> tuple[pose.Memory, Placed]:
+    def look(self, now: Instant, kept: tuple[pose.Cloud, Placed]) -> tuple[pose.Cloud, Placed]:
         """One instant more: the cloud steps at its own period."""
-        every = round(pose.PERIOD / simulator.dt)
+        every = round(pose.PERIOD / now.simulator.dt)
 
-        def step(kept: tuple[pose.Memory, Placed]) -> tuple[pose.Memory, Placed]:
+        def step(kept: tuple[pose.Cloud, Placed]) -> tuple[pose.Cloud, Placed]:
             cloud, placed = kept
-            _, seen = pilot.observe(memory, heard(simulator, loop), loop.tick)
-            cloud = self.place.update(cloud, loop.readings.sonar, _slim(seen.estimate), pose.PERIOD)
+            _, seen = now.pilot.observe(now.memory, heard(now.simulator, now.loop), now.loop.tick)
+            cloud = self.place.update(
+                cloud, now.loop.readings.sonar, _slim(seen.estimate), pose.PERIOD
+            )
             best = pose.best(cloud)
-            motion = simulator.world.motion(loop.state)
+            motion = now.simulator.world.motion(now.loop.state)
             cosine, sine = jnp.cos(self.turns), jnp.sin(self.turns)
             dx, dy = motion.x - self.middle[0], motion.y - self.middle[1]
             x = self.middle[0] + cosine * dx - sine * dy
@@ -244,13 +226,13 @@ class Places:
             angle = jnp.abs(jnp.arctan2(jnp.sin(off), jnp.cos(off)))
             good = jnp.any((distance < SETTLED[0]) & (angle < SETTLED[1]))
             since = jnp.where(good, jnp.minimum(placed.settled_at, seen.time), jnp.inf)
-            open_yet = jnp.isinf(score.turns.end[1])
-            now = Placed(distance, angle, best.share, since)
-            return cloud, jax.tree.map(lambda a, b: jnp.where(open_yet, a, b), now, placed)
+            open_yet = jnp.isinf(now.score.turns.end[1])
+            found = Placed(distance, angle, best.share, since)
+            return cloud, jax.tree.map(lambda a, b: jnp.where(open_yet, a, b), found, placed)
 
-        return jax.lax.cond(loop.tick % every == 0, step, lambda same: same, kept)
+        return jax.lax.cond(now.loop.tick % every == 0, step, lambda same: same, kept)
 
-    def end(self, kept: tuple[pose.Memory, Placed]) -> Placed:
+    def end(self, kept: tuple[pose.Cloud, Placed]) -> Placed:
         """Without the cloud."""
         return kept[1]
 

@@ -12,6 +12,7 @@ import pytest
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
+from countersteer.compiling import configure_jax
 from countersteer.course.course import Course
 from countersteer.drivers.replay import Replay
 from countersteer.link.link import ONBOARD, Link
@@ -21,7 +22,7 @@ from countersteer.recording import about_run
 from countersteer.recording import drive as write_drive
 from countersteer.runs.run import Run, read_run
 from countersteer.signals import Motion
-from countersteer.simulator import Record, Simulator, keep_programs
+from countersteer.simulator import Record, Simulator
 from countersteer.task import turns
 from countersteer.task.task import PERIOD, Sample, Score, Task
 from countersteer.world import planar
@@ -34,7 +35,7 @@ ROWS = 8  # walls of each car
 SLOTS = 512  # of the delay lines: 20 ms at the finest step
 
 
-keep_programs()  # before anything computes: it sets how to compile
+configure_jax()  # before anything computes: it sets how to compile
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from countersteer import cli
-from countersteer.batch import blocks
 from countersteer.bench import bench
+from countersteer.bench.fleet import Fleet, advance
 
 TICKS = 10
 TINY = bench.Size(rounds=1, least=0.0, cars=8, ticks=TICKS, growth=(8,), warms=0, variants=False)
@@ -21,16 +21,20 @@ TINY = bench.Size(rounds=1, least=0.0, cars=8, ticks=TICKS, growth=(8,), warms=0
 IN_BLOCKS = f"""
 import os, sys
 import numpy as np
-from countersteer.batch import blocks
+from functools import partial
+from countersteer.batch import engine
 from countersteer.bench import bench
-os.environ["XLA_FLAGS"] = blocks.flags(2)
+os.environ["XLA_FLAGS"] = engine.flags(2)
 import jax
-from countersteer.simulator import keep_programs
-keep_programs()
+from countersteer.compiling import configure_jax
+configure_jax()
+from countersteer.bench.fleet import Fleet, advance
 for varied in (False, True):
-    fleet = bench.Fleet(128, 2, varied=varied, block=32)
+    fleet = Fleet(128, 2, varied=varied, block=32)
     assert fleet.cars == 128
-    program = fleet.compiled(blocks.in_blocks(bench.DT, {TICKS}, lanes=32))
+    program = fleet.compiled(
+        engine.in_one_program(partial(advance, dt=bench.DT, ticks={TICKS}), lanes=32)
+    )
     ends = np.stack([np.asarray(leaf) for leaf in jax.tree.leaves(program(*fleet.inputs()).motion)])
     np.save(sys.argv[1 + varied], ends)
 """
@@ -41,10 +45,10 @@ def test_a_batch_in_blocks_on_two_cores_is_what_vmap_gives(tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     subprocess.run([sys.executable, "-c", IN_BLOCKS, *files], check=True, env=environment)
     with jax.enable_x64(False):
-        advance = jax.jit(partial(blocks.advance, dt=bench.DT, ticks=TICKS))
+        one_by_one = jax.jit(partial(advance, dt=bench.DT, ticks=TICKS))
         for varied, file in enumerate(files):
-            fleet = bench.Fleet(128, 1, varied=bool(varied), block=64)
-            plain = advance(*fleet.inputs()).motion
+            fleet = Fleet(128, 1, varied=bool(varied), block=64)
+            plain = one_by_one(*fleet.inputs()).motion
             expected = np.stack([np.asarray(leaf) for leaf in jax.tree.leaves(plain)])
             found = np.load(file)
             assert found.shape == expected.shape
@@ -58,15 +62,16 @@ AS_C = f"""
 from functools import partial
 import sys
 import numpy as np
-from countersteer.simulator import keep_programs
-keep_programs()
+from countersteer.compiling import configure_jax
+configure_jax()
 import jax
-from countersteer.batch import blocks
 from countersteer.bench import bench
+from countersteer.bench.fleet import Fleet, advance
 from countersteer.bench.native import Native
-fleet = bench.Fleet(64, 1, block=64)
-advance = jax.jit(partial(blocks.advance, dt=bench.DT, ticks={TICKS}))
-plain = np.stack([np.asarray(leaf) for leaf in jax.tree.leaves(advance(*fleet.inputs()).motion)])
+fleet = Fleet(64, 1, block=64)
+one_by_one = jax.jit(partial(advance, dt=bench.DT, ticks={TICKS}))
+motion = one_by_one(*fleet.inputs()).motion
+plain = np.stack([np.asarray(leaf) for leaf in jax.tree.leaves(motion)])
 np.save(sys.argv[1], plain)
 np.save(sys.argv[2], Native(fleet, 2).run({TICKS})[:, :len(plain)].T)
 """

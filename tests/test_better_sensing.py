@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from countersteer.batch.population import draw, load_population
-from countersteer.batch.rollout import watched
+from countersteer.batch.trials import run_trials
 from countersteer.car.files import load_car
 from countersteer.course.course import from_segments
 from countersteer.course.files import load_course
@@ -73,7 +73,7 @@ def test_a_place_told_late_is_known_now(reports):
     for _ in range(12):
         loop, memory, record = scan(simulator, pilot, 250, loop, memory)
         motion, known = loop.state.motion, memory.estimate
-        off.append((known.x - motion.x, known.y - motion.y, known.mean[3] - motion.heading))
+        off.append((known.x - motion.x, known.y - motion.y, known.belief.mean[3] - motion.heading))
         assert not np.any(record.wall_contacts)
     # The filter was at the last tick but four; at 2 m/s that is a centimetre.
     worst = np.max(np.abs(off[2:]), axis=0)
@@ -86,7 +86,7 @@ def test_whoever_is_told_the_truth_makes_no_errors():
     driver = drift_turn(course, car)
     watch = Errors(lane=lane(course), sonar=car.sensors.sonar, inside=float(chi2.ppf(0.95, 3)))
     pilot = Pilot.of(driver, course, car, "truth")
-    score, kept = watched(course, pilot, drawn, [driver] * 4, seeds, 1, 12.0, watch, lanes=4)
+    score, kept = run_trials(course, pilot, drawn, [driver] * 4, seeds, 1, 12.0, watch, lanes=4)
     assert np.all(score.outcome == Outcome.REACHED.code)
     assert np.all(kept.drifting > 50)
     np.testing.assert_allclose(kept.slip, 0.0, atol=1e-12)

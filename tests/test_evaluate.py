@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import driven, judged
-from countersteer.batch import rollout
+from countersteer.batch import trials
 from countersteer.batch.evaluate import interval
 from countersteer.batch.population import draw, load_population
 from countersteer.car.files import load_car
@@ -101,7 +101,7 @@ def test_a_batch_judges_as_a_recorded_drive_is_judged():
     course, car, seeds = load_course("ess"), load_car("rx7"), range(4)
     drawn = draw(load_population("around"), car, course, seeds, np.float64)
     driver = drift_turn(course, car)
-    score = rollout.rollouts(
+    score, _ = trials.run_trials(
         course, Pilot.of(driver, course, car), drawn, [driver] * 4, seeds, 1, 14.0, lanes=4
     )
     for i in seeds:

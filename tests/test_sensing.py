@@ -238,9 +238,9 @@ def listen() -> Callable[..., suite.Readings]:
     corners = np.asarray(sonar.edges(walls))
 
     def run(
-        car: Car, motion: Motion, memory: suite.Memory, key: jax.Array, every: suite.Periods
+        car: Car, motion: Motion, memory: suite.SensorMemory, key: jax.Array, every: suite.Periods
     ) -> suite.Readings:
-        def tick(memory: suite.Memory, now: tuple) -> tuple:
+        def tick(memory: suite.SensorMemory, now: tuple) -> tuple:
             count, motion = now
             memory = suite.sense(car, walls, corners, memory, motion, key, count, every, DT)
             return memory, memory.readings

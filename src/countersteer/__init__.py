@@ -44,9 +44,9 @@ def __getattr__(name: str) -> Any:
     if name not in _NAMES:
         raise AttributeError(f"module 'countersteer' has no attribute {name!r}")
     if name in ("Simulator", "Pilot"):
-        from countersteer.simulator import keep_programs
+        from countersteer.compiling import configure_jax
 
-        keep_programs(batches=False)
+        configure_jax(batches=False)
     found = getattr(importlib.import_module(f"countersteer.{_NAMES[name]}"), name)
     globals()[name] = found
     return found

@@ -11,6 +11,7 @@ import numpy as np
 from countersteer.batch import evaluate as evaluation
 from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
+from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.library import make_driver
@@ -23,7 +24,6 @@ from countersteer.runs.files import read_commands
 from countersteer.runs.recorder import new_folder
 from countersteer.runs.run import Run as RunFolder
 from countersteer.runs.run import read_run
-from countersteer.simulator import keep_programs
 from countersteer.viewing.picture import draw_picture
 from countersteer.viewing.report import report_html
 from countersteer.viewing.view import view_of
@@ -110,7 +110,7 @@ def drive(
     told of. `speed` in m/s, `battery` is the charge from 0 to 1, `dt` in seconds. The run's folder
     is `out`, or a new one under `runs/`. Raises `InputError` with one line where an input is wrong.
     """
-    keep_programs(batches=False, cores=2)
+    configure_jax(batches=False, cores=2)
     where, simulated = load_course(course), load_car(car, set)
     if link not in LINKS:
         raise InputError(f"link: one of {', '.join(LINKS)}, not {link}")
@@ -156,7 +156,7 @@ def evaluate(
 
     `speed` is a range in m/s. Fastest as the first thing that a process does with JAX.
     """
-    keep_programs(blocks=True, cores=os.cpu_count() or 1)
+    configure_jax(blocks=True, cores=os.cpu_count() or 1)
     where, nominal = load_course(course), load_car(car)
     if where.goal_distance is None:
         raise InputError(f"{course}: has no goal, so nothing tells a success")

@@ -37,7 +37,7 @@ PYTHON_PERIOD = 0.005  # s between two decisions of a driver in plain Python, un
 LOCKS = (-math.pi / 2, math.pi / 2)  # rad, that a car can be asked to steer
 
 
-class Memory(NamedTuple):
+class PilotMemory(NamedTuple):
     """What the pilot carries from one decision to the next."""
 
     estimate: Any  # the estimator's
@@ -124,14 +124,16 @@ class Pilot:
             )
             return jax.tree.map(np.asarray, _rerun(self, streams.root(seed), told, ticks))
 
-    def init(self, root: jax.Array) -> Memory:
+    def init(self, root: jax.Array) -> PilotMemory:
         """Before the first decision; `root` is the drive's key (`streams.root`)."""
         if isinstance(root, jax.core.Tracer):
             return _init(self, root)
         with jax.enable_x64(self.dtype == np.float64):
             return _compiled_init(self, root) if self.traced else _init(self, root)
 
-    def act(self, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Command, Memory]:
+    def act(
+        self, memory: PilotMemory, readings: Readings, tick: Scalar
+    ) -> tuple[Command, PilotMemory]:
         """The command from this tick on, and the memory after it.
 
         Called from Python it is compiled. Raises `InputError` where a driver in Python returns
@@ -148,9 +150,11 @@ class Pilot:
             command, own = checked(self.driver, answer)
             asked = (np.clip(command.throttle, -1, 1), np.clip(command.steering, *LOCKS))
             command = Command(*map(self.dtype.type, asked))
-            return command, Memory(estimate, own, command)
+            return command, PilotMemory(estimate, own, command)
 
-    def observe(self, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Any, Observation]:
+    def observe(
+        self, memory: PilotMemory, readings: Readings, tick: Scalar
+    ) -> tuple[Any, Observation]:
         """The estimator's memory at this tick, and what the driver is told."""
         told = readings if self.estimator.takes_truth else readings._replace(truth=None)
 
@@ -174,25 +178,27 @@ class Pilot:
         ages: Any = jax.tree.map(heard, told[:-1], is_leaf=lambda node: isinstance(node, Reading))
         return estimate, Observation(*(self.dt * tick.astype(dtype), *ages, known))
 
-    def status(self, memory: Memory) -> Status:
+    def status(self, memory: PilotMemory) -> Status:
         """What the driver says it is about."""
         return status_of(self.driver, memory.driver)
 
 
-def _init(pilot: Pilot, root: jax.Array) -> Memory:
+def _init(pilot: Pilot, root: jax.Array) -> PilotMemory:
     estimate = pilot.estimator.init(streams.key(root, Stream.ESTIMATOR))
     memory = pilot.driver.reset(streams.key(root, Stream.DRIVER))
     dtype = jnp.result_type(pilot.estimator.estimate(estimate).x)
     if pilot.traced:
         memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
     zero = dtype.type(0)
-    return Memory(estimate, memory, Command(zero, zero))
+    return PilotMemory(estimate, memory, Command(zero, zero))
 
 
-def _act(pilot: Pilot, memory: Memory, readings: Readings, tick: Scalar) -> tuple[Command, Memory]:
+def _act(
+    pilot: Pilot, memory: PilotMemory, readings: Readings, tick: Scalar
+) -> tuple[Command, PilotMemory]:
     estimate, observation = pilot.observe(memory, readings, tick)
     command, own = pilot.driver.act(memory.driver, observation)
-    after = Memory(
+    after = PilotMemory(
         estimate,
         jax.tree.map(_like, own, memory.driver),
         jax.tree.map(_like, bounded(command), memory.command),
@@ -206,7 +212,7 @@ _compiled_observe = jax.jit(Pilot.observe)
 
 @jax.jit
 def _rerun(pilot: Pilot, root: jax.Array, readings: Readings, ticks: Array) -> Command:
-    def decide(memory: Memory, now: tuple[Readings, Scalar]) -> tuple[Memory, Command]:
+    def decide(memory: PilotMemory, now: tuple[Readings, Scalar]) -> tuple[PilotMemory, Command]:
         command, memory = pilot.act(memory, *now)
         return memory, command
 

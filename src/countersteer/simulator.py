@@ -11,11 +11,8 @@ goes over the link, the world takes a step, and the sensors look at where it led
 
 import dataclasses
 import math
-import os
-import warnings
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +25,7 @@ from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Status
 from countersteer.link.link import ONBOARD, Link, Packets, exchange, initial_packets
-from countersteer.pilot import Memory, Pilot
+from countersteer.pilot import Pilot, PilotMemory
 from countersteer.sensing import faults as failing
 from countersteer.sensing import sonar, suite
 from countersteer.sensing.faults import Fault
@@ -50,7 +47,7 @@ class Loop(NamedTuple):
 
     tick: Scalar
     state: Any  # the world's
-    sensors: suite.Memory
+    sensors: suite.SensorMemory
     up: Packets | None  # None: the pilot is on board
     down: Packets | None
     faulty: Readings | None = None  # what failing sensors have reported; None: none ever fails
@@ -292,11 +289,11 @@ def _apply(simulator: Simulator, ticks: int, loop: Loop, command: Command) -> tu
 
 
 def tick(
-    simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory
-) -> tuple[Loop, Memory, Record]:
+    simulator: Simulator, pilot: Pilot, loop: Loop, memory: PilotMemory
+) -> tuple[Loop, PilotMemory, Record]:
     """One tick with a pilot that JAX can trace."""
 
-    def act(memory: Memory) -> Memory:
+    def act(memory: PilotMemory) -> PilotMemory:
         return pilot.act(memory, heard(simulator, loop), loop.tick)[1]
 
     said = pilot.status(memory)
@@ -309,11 +306,11 @@ def tick(
 
 @partial(jax.jit, static_argnums=2)
 def scan(
-    simulator: Simulator, pilot: Pilot, ticks: int, loop: Loop, memory: Memory
-) -> tuple[Loop, Memory, Record]:
+    simulator: Simulator, pilot: Pilot, ticks: int, loop: Loop, memory: PilotMemory
+) -> tuple[Loop, PilotMemory, Record]:
     """So many ticks with a pilot that JAX can trace."""
 
-    def one(carry: tuple[Loop, Memory], _: None) -> tuple[tuple[Loop, Memory], Record]:
+    def one(carry: tuple[Loop, PilotMemory], _: None) -> tuple[tuple[Loop, PilotMemory], Record]:
         loop, memory, record = tick(simulator, pilot, *carry)
         return (loop, memory), record
 
@@ -322,8 +319,8 @@ def scan(
 
 
 def steps(
-    simulator: Simulator, pilot: Pilot, ticks: int, loop: Loop, memory: Memory
-) -> tuple[Loop, Memory, Record]:
+    simulator: Simulator, pilot: Pilot, ticks: int, loop: Loop, memory: PilotMemory
+) -> tuple[Loop, PilotMemory, Record]:
     """The same with any pilot, a decision at a time."""
     records = []
     for _ in range(ticks // pilot.control):
@@ -345,42 +342,3 @@ def voltage(car: Car, motion: Motion) -> Scalar:
     return motor.drive(
         car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven
     ).battery_voltage
-
-
-def keep_programs(batches: bool = True, blocks: bool = False, cores: int = 1) -> None:
-    """Settings for the process: compile well, and keep compiled programs in the user's cache.
-
-    To be called before JAX computes anything; the command line does. A library does not do this
-    behind its user's back. Without it all works, but starts and runs at half the speed or less.
-    A process that drives one car at a time may say so, and drives it twice as fast. One that works
-    through many cars in blocks of some hundred may say `blocks`: then a whole loop is one function
-    whose numbers stay in the core's caches. `cores` is how many devices JAX makes of the CPU.
-    """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {compiler_flags(batches, blocks, cores=cores)}".strip()
-    # A cache that cannot be read or written is no cache, and nothing to trouble anyone with.
-    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    jax.config.update("jax_compilation_cache_dir", str(Path(home) / "countersteer" / "jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-def compiler_flags(
-    batches: bool = True, blocks: bool = False, backend: Sequence[str] = (), cores: int = 1
-) -> str:
-    """What XLA is told (`keep_programs`); `backend` holds further options of its backend."""
-    # Without this, scalars that several results need are computed anew for each of them.
-    options = ["xla_cpu_use_multi_output_fusion"]
-    flags = []
-    if batches:
-        # XLA's newer emitters abort the process on some batched programs with it (0.10.2).
-        flags.append("--xla_cpu_use_fusion_emitters=false")
-    if blocks:
-        # A loop whose numbers take less bytes is compiled into one function.
-        options.append("xla_cpu_small_while_loop_byte_threshold=100000000")
-        flags.append("--xla_cpu_prefer_vector_width=512")
-    if cores > 1:
-        flags.append(f"--xla_force_host_platform_device_count={cores}")
-    return " ".join([f"--xla_backend_extra_options={','.join([*options, *backend])}", *flags])

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from countersteer.batch.engine import LANES
 from countersteer.batch.population import Population, draw
-from countersteer.batch.rollout import LANES, Watch, watched
+from countersteer.batch.trials import Watch, run_trials
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
@@ -47,9 +48,9 @@ class Trials:
         report: Callable[[int, int], None] = lambda *_: None,
     ) -> Score:
         """All trials of one driver, in 32 bits; `make` makes it for a speed."""
-        return self.watched(make, None, report)[0]
+        return self.run_watched(make, None, report)[0]
 
-    def watched(
+    def run_watched(
         self,
         make: Callable[[float | None], Driver],
         watch: Watch | None,
@@ -66,7 +67,7 @@ class Trials:
             drivers = [made[speed] for speed in drawn.speed.tolist()]
         pilot = Pilot.of(drivers[0], self.course, self.nominal, self.estimate, self.link, self.dt)
         longest = 3.0 + (self.course.lap_end(self.laps) or 0.0) / SLOWEST
-        return watched(
+        return run_trials(
             self.course,
             pilot,
             drawn,

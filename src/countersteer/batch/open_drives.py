@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 
-from countersteer.batch.rollout import LANES
+from countersteer.batch import engine
+from countersteer.batch.engine import LANES
 from countersteer.car.car import Car
 from countersteer.drivers.driver import Driver, Heard, Observation
 from countersteer.drivers.replay import Replay
@@ -33,8 +34,8 @@ STEPS = 4
 NOTHING = Heard(math.nan, math.inf)
 
 
-class Lanes(NamedTuple):
-    """What the drives run with; leaves have an axis of drives in front."""
+class OpenDrive(NamedTuple):
+    """What a drive has of its own; in a batch, leaves have an axis of drives in front."""
 
     car: Car
     driver: Any
@@ -74,28 +75,25 @@ def drives(
     dtype = np.asarray(charge).dtype
     driver = jax.tree.map(lambda *leaves: np.stack(leaves).astype(dtype), *drivers)
     pose = np.zeros((len(drivers), 3)) if pose is None else pose
-    own = Lanes(cars, driver, charge, np.asarray(velocity, dtype), np.asarray(pose, dtype), floor)
+    own = OpenDrive(
+        cars, driver, charge, np.asarray(velocity, dtype), np.asarray(pose, dtype), floor
+    )
     around = padded(np.zeros((0, 4)) if walls is None else walls, dtype)
-    mesh = Mesh(np.array(jax.devices()), ("core",))
-    count, width = len(drivers), lanes * mesh.size
-    pieces, kept = math.ceil(longest / (PIECE * PERIOD)), round(longest / PERIOD)
+    mesh = engine.all_cores()
+    pieces, samples = math.ceil(longest / (PIECE * PERIOD)), round(longest / PERIOD)
     slots = planar.delay_slots(cars, DT)
-    blocks = []
-    for first in range(0, count, width):
-        picked, rows = np.arange(first, first + width) % count, min(width, count - first)
-        block = jax.tree.map(lambda leaf, picked=picked: np.asarray(leaf)[picked], own)
-        loop = _start(mesh, slots, block)
-        records = []
+
+    def run(block: OpenDrive, done: Callable[[float], None]) -> Any:
+        loop, records = _start(mesh, slots, block), []
         for piece in range(pieces):
             tick = np.int32(piece * PIECE * round(PERIOD / DT))
-            loop, record = _piece(mesh, around, block, loop, tick)
-            records.append(jax.tree.map(lambda leaf, n=rows: np.asarray(leaf)[:n], record))
-            report(first * pieces + (piece + 1) * rows, count * pieces)
-        blocks.append(
-            jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :kept], *records)
-        )
+            loop, record = _piece(mesh, block, loop, around, tick)
+            records.append(jax.tree.map(np.asarray, record))
+            done((piece + 1) / pieces)
+        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :samples], *records)
+
     return Sampled(
-        PERIOD * np.arange(kept), *jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+        PERIOD * np.arange(samples), *engine.in_turn(run, own, lanes * mesh.size, report)
     )
 
 
@@ -103,7 +101,7 @@ def drives(
 def _start(mesh: Mesh, slots: int, block: Any) -> Any:
     """State and driver's memory before the first tick."""
 
-    def one(own: Lanes) -> Any:
+    def one(own: OpenDrive) -> Any:
         v, at = own.velocity, own.pose
         state = planar.initial_state(
             own.car, DT, (at[0], at[1], at[2]), (v[0], v[1], v[2]), own.charge, slots
@@ -113,16 +111,15 @@ def _start(mesh: Mesh, slots: int, block: Any) -> Any:
             (state, own.driver.reset(jax.random.key(0))),
         )
 
-    cut = PartitionSpec("core")
-    return _on_cores(mesh, jax.vmap(one), (cut,))(block)
+    return engine.on_cores(jax.vmap(one), mesh, (True,))(block)
 
 
 @partial(jax.jit, static_argnums=0)
-def _piece(mesh: Mesh, walls: Any, block: Any, loop: Any, tick: Any) -> Any:
+def _piece(mesh: Mesh, block: Any, loop: Any, walls: Any, tick: Any) -> Any:
     """The next `PIECE` samples: the motion at each, and the command that is asked for then."""
     every = round(PERIOD / DT)
 
-    def one(walls: Any, own: Lanes, loop: Any) -> Any:
+    def one(own: OpenDrive, loop: Any, walls: Any) -> Any:
         def next_tick(carry: Any, count: Any) -> Any:
             state, memory = carry
             command, after = own.driver.act(memory, observed(state, count))
@@ -139,9 +136,8 @@ def _piece(mesh: Mesh, walls: Any, block: Any, loop: Any, tick: Any) -> Any:
         firsts = tick + every * jnp.arange(PIECE, dtype=jnp.int32)
         return jax.lax.scan(look, loop, firsts)
 
-    cut, same = PartitionSpec("core"), PartitionSpec()
-    lanes = jax.vmap(one, (None, 0, 0))
-    return _on_cores(mesh, lanes, (same, cut, cut))(walls, block, loop)
+    lanes = jax.vmap(one, (0, 0, None))
+    return engine.on_cores(lanes, mesh, (True, True, False))(block, loop, walls)
 
 
 def observed(state: State, count: Any) -> Observation:
@@ -153,14 +149,6 @@ def observed(state: State, count: Any) -> Observation:
     return Observation(**heard | {"time": time, "sonar": (), "estimate": known})
 
 
-def _on_cores(mesh: Mesh, run: Callable[..., Any], inputs: Any) -> Callable[..., Any]:
-    """A share of the lanes on each core."""
-    made: Callable[..., Any] = jax.shard_map(
-        run, mesh=mesh, in_specs=inputs, out_specs=PartitionSpec("core"), check_vma=False
-    )
-    return made
-
-
 def commands(*steps: tuple[float, float, float]) -> Replay:
     """Open-loop commands of up to `STEPS` steps: time, throttle, steering (rad)."""
     # As many for all, so that they share a program.
@@ -168,7 +156,7 @@ def commands(*steps: tuple[float, float, float]) -> Replay:
     return Replay(times=padded[0], throttle=padded[1], steering=padded[2])
 
 
-def batch(car: Car, count: int) -> Car:
+def repeated(car: Car, count: int) -> Car:
     """So many of one car, in 32 bits."""
     many: Car = jax.tree.map(lambda leaf: np.broadcast_to(np.float32(leaf), (count,)), car)
     return many

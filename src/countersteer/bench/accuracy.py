@@ -10,8 +10,8 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
+from countersteer.compiling import configure_jax
 from countersteer.signals import Command
-from countersteer.simulator import keep_programs
 from countersteer.world import planar
 
 DURATION = 1.0  # s
@@ -84,5 +84,5 @@ def table(names: tuple[str, ...]) -> str:
 
 
 if __name__ == "__main__":
-    keep_programs()
+    configure_jax()
     Path(sys.argv[1]).write_text(table(("rx7", "jetracer", "jetracer-tape")))

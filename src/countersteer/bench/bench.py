@@ -65,26 +65,29 @@ def rate(work: float, run: Callable[[], Any], least: float) -> float:
 
 def planar_side(size: Size) -> Iterator[dict[str, Any]]:
     """The planar world in 32 bits, rx7 on box with walls and all stages."""
-    from countersteer.batch import blocks
+    from countersteer.batch.engine import CACHED_LANES, in_one_program
+    from countersteer.bench.fleet import Fleet, advance
     from countersteer.bench.profile import profile
 
     count = cores()
     runs: dict[str, tuple[float, Callable[[], Any]]] = {}
     problem = Fleet(size.cars, count)
-    program = problem.compiled(whole := blocks.in_blocks(DT, size.ticks))
+    program = problem.compiled(whole := in_one_program(partial(advance, dt=DT, ticks=size.ticks)))
     work = float(problem.cars * size.ticks)
     runs["planar_batch_steps_per_s"] = (work, problem.call(program))
-    facts: dict[str, Any] = {"profile": profile(program.as_text(), blocks.LANES)}
+    facts: dict[str, Any] = {"profile": profile(program.as_text(), CACHED_LANES)}
     facts |= {"ends": problem.manoeuvres(program, size.ticks)}
     if size.variants:
         varied = Fleet(size.cars, count, varied=True)
         runs["planar_varied_steps_per_s"] = (work, varied.call(varied.compiled(whole)))
         large = Fleet(size.cars, count, dt=LARGE_DT)
-        at_large = large.compiled(blocks.in_blocks(LARGE_DT, size.ticks))
+        at_large = large.compiled(in_one_program(partial(advance, dt=LARGE_DT, ticks=size.ticks)))
         runs["planar_large_step_steps_per_s"] = (work, large.call(at_large))
         facts |= {"ends_large": large.manoeuvres(at_large, size.ticks)}
         alone = Fleet(size.cars, 1)
-        one_core = alone.compiled(blocks.in_blocks(DT, size.ticks, cores=1))
+        one_core = alone.compiled(
+            in_one_program(partial(advance, dt=DT, ticks=size.ticks), cores=1)
+        )
         runs["planar_one_core_steps_per_s"] = (
             float(alone.cars * size.ticks),
             alone.call(one_core),
@@ -92,10 +95,12 @@ def planar_side(size: Size) -> Iterator[dict[str, Any]]:
     for lanes in size.growth:
         if lanes == size.cars:
             continue
-        spread = lanes >= blocks.LANES * count
+        spread = lanes >= CACHED_LANES * count
         fleet = Fleet(lanes, count) if spread else Fleet(lanes, 1, block=lanes)
-        stepped = blocks.in_blocks(
-            DT, size.ticks, blocks.LANES if spread else lanes, count if spread else 1
+        stepped = in_one_program(
+            partial(advance, dt=DT, ticks=size.ticks),
+            CACHED_LANES if spread else lanes,
+            count if spread else 1,
         )
         run = fleet.call(fleet.compiled(stepped))
         runs[f"lanes_{lanes}"] = (float(lanes * size.ticks), run)
@@ -104,102 +109,17 @@ def planar_side(size: Size) -> Iterator[dict[str, Any]]:
         yield {name: rate(work, run, size.least) for name, (work, run) in runs.items()}
 
 
-class Fleet:
-    """Cars in random drives on box: the inputs of a batch."""
-
-    def __init__(
-        self,
-        cars: int,
-        cores: int,
-        varied: bool = False,
-        block: int | None = None,
-        dt: float = DT,
-    ):
-        """At least so many cars, in whole blocks on each core; `varied`: each another car."""
-        import jax
-        import jax.numpy as jnp
-
-        from countersteer.batch import blocks
-        from countersteer.car.files import load_car
-        from countersteer.course.files import load_course
-        from countersteer.signals import Wheels
-        from countersteer.world import planar
-        from countersteer.world.walls import padded
-
-        self.dt = dt
-        self.cars = cars = blocks.spread(cars, block or blocks.LANES, cores)
-        rng = np.random.default_rng(0)
-        course, car = load_course("box"), load_car("rx7")
-        car = jax.tree.map(np.float32, car)
-        start = planar.initial_state(car, dt, course.start)
-        self.states = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], cars, 0), start)
-        # Anywhere on the corridor's first side, about along it.
-        speed = rng.uniform(0.0, 3.0, cars).astype(np.float32)
-        rolling = [speed / tire.radius for tire in planar.tires_by_wheel(car)]
-        motion = self.states.motion._replace(
-            wheels=Wheels(*rolling),
-            x=rng.uniform(0.0, 3.0, cars).astype(np.float32),
-            y=rng.uniform(-0.4, 0.4, cars).astype(np.float32),
-            heading=rng.uniform(-0.5, 0.5, cars).astype(np.float32),
-            vx=speed,
-        )
-        self.states = self.states._replace(motion=motion)
-        self.commands = planar.Command(
-            rng.uniform(0.0, 1.0, cars).astype(np.float32),
-            rng.uniform(-0.5, 0.5, cars).astype(np.float32),
-        )
-        self.walls = padded(course.walls, np.dtype(np.float32))
-        if varied:  # downwards: a differential that is locked must not get beyond it
-            car = jax.tree.map(lambda p: (p * rng.uniform(0.95, 1.0, cars)).astype(np.float32), car)
-        self.car = car
-        self.states, self.commands, self.car = jax.tree.map(
-            jnp.asarray, (self.states, self.commands, self.car)
-        )
-
-    def compiled(self, program: Any) -> Any:
-        """The program for these inputs."""
-        return program.lower(*self.inputs()).compile()
-
-    def inputs(self) -> tuple[Any, ...]:
-        """Of the program."""
-        return self.car, self.walls, self.states, self.commands, np.int32(0)
-
-    def call(self, program: Any) -> Callable[[], Any]:
-        """One run of it from the start."""
-        import jax
-
-        return lambda: jax.block_until_ready(program(*self.inputs()))
-
-    def manoeuvres(self, program: Any, ticks: int) -> list[list[float]]:
-        """Where (x and y, m) the lanes are at the end of the manoeuvres of docs/accuracy.md."""
-        import jax
-
-        from countersteer.bench.accuracy import DURATION, MANOEUVRES
-        from countersteer.world import planar
-
-        begins = [planar.initial_state(self.car, self.dt, velocity=m.velocity) for m in MANOEUVRES]
-        lanes = np.arange(self.cars) % len(begins)
-        states = jax.tree.map(lambda *leaves: np.stack(leaves)[lanes].astype(np.float32), *begins)
-        asked = np.array([m.command for m in MANOEUVRES], np.float32)[lanes].T
-        walls = np.full_like(self.walls, np.nan)
-        for first in range(0, round(DURATION / self.dt), ticks):
-            commands = planar.Command(asked[0], asked[1])
-            states = program(self.car, walls, states, commands, np.int32(first))
-        motion = states.motion
-        return [[float(motion.x[i]), float(motion.y[i])] for i in range(len(begins))]
-
-
 def plain_side(size: Size) -> Iterator[dict[str, Any]]:
     """The same batch by `vmap` alone, and the converged manoeuvres in 64 bits."""
     import jax
 
-    from countersteer.batch import blocks
     from countersteer.bench import accuracy
+    from countersteer.bench.fleet import Fleet, advance
     from countersteer.car.files import load_car
 
     fleet = Fleet(min(size.cars, 2048), 1)
     ticks = min(size.ticks, 20)
-    program = fleet.compiled(jax.jit(partial(blocks.advance, dt=DT, ticks=ticks)))
+    program = fleet.compiled(jax.jit(partial(advance, dt=DT, ticks=ticks)))
     yield {"converged": accuracy.positions(load_car("rx7"), accuracy.FINEST)[:, :2].tolist()}
     while True:
         work = float(fleet.cars * ticks)
@@ -265,6 +185,7 @@ def thinking(simulator: Any, pilot: Any) -> tuple[Any, Any, Any]:
 
 def native_side(size: Size) -> Iterator[dict[str, Any]]:
     """The same equations as C, compiled for this machine's vectors; and the machine's peak."""
+    from countersteer.bench.fleet import Fleet
     from countersteer.bench.native import Native
 
     native = Native(Fleet(size.cars, 1), cores())
@@ -290,13 +211,13 @@ SIDES: dict[str, Callable[[Size], Iterator[dict[str, Any]]]] = {
 
 def serve(side: str, size: Size) -> None:
     """A side's process: a line of JSON when ready, and one for each line that it is sent."""
-    from countersteer.simulator import keep_programs
+    from countersteer.compiling import configure_jax
 
     if side == "planar":
-        from countersteer.batch.blocks import flags
+        from countersteer.batch.engine import flags
 
         os.environ["XLA_FLAGS"] = flags(cores())
-    keep_programs(batches=side != "drive")
+    configure_jax(batches=side != "drive")
     rounds = SIDES[side](size)
     print(json.dumps(next(rounds)), flush=True)
     for _ in sys.stdin:

@@ -56,14 +56,14 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.batch import evaluate
     from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.drivers.library import make_driver
     from countersteer.link.link import LINKS
     from countersteer.runs.files import read_commands
     from countersteer.runs.recorder import new_folder
-    from countersteer.simulator import keep_programs
 
-    keep_programs(blocks=True, cores=os.cpu_count() or 1)
+    configure_jax(blocks=True, cores=os.cpu_count() or 1)
     course, car = load_course(options.course), load_car(options.car, options.set)
     check_laps(options, course)
     if course.goal_distance is None:

@@ -37,14 +37,14 @@ def run(options: argparse.Namespace) -> int:
     """`experiment`."""
     from countersteer import experiments
     from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
     from countersteer.experiments.found import write
     from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
-    from countersteer.simulator import keep_programs
 
     # Only the closed loop is worth its time in a compiler that makes a function of it.
     closed = options.name in ("control-rate", "linked-turns")
-    keep_programs(blocks=closed, cores=os.cpu_count() or 1)
+    configure_jax(blocks=closed, cores=os.cpu_count() or 1)
     module, car = experiments.load(options.name), load_car(options.car, options.set)
     if options.runs and not hasattr(module, "measure"):
         raise InputError(f"--from: {options.name} is simulated, and measures no run")

@@ -100,14 +100,14 @@ def run_turn(options: argparse.Namespace) -> int:
     """`learn turn`."""
     from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import load_policy, save_policy
     from countersteer.learning.turning import Generation, search
-    from countersteer.simulator import keep_programs
 
     if options.out.suffix != ".toml":
         raise InputError(f"--out {options.out}: name a .toml file")
-    keep_programs(blocks=True, cores=os.cpu_count() or 1)
+    configure_jax(blocks=True, cores=os.cpu_count() or 1)
     courses = [load_course(name) for name in options.courses]
     history: list[dict[str, float]] = []
 

@@ -18,15 +18,15 @@ TRACED = 0.9  # s by when the loop has been traced, which needs Python, and is b
 
 def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
+    from countersteer.compiling import configure_jax
     from countersteer.recording import drive
     from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
-    from countersteer.simulator import keep_programs
     from countersteer.viewing.picture import Painter
     from countersteer.viewing.report import report_html
     from countersteer.viewing.view import view_of
 
-    keep_programs(batches=False, cores=2)
+    configure_jax(batches=False, cores=2)
     folder = new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}")
     painter = Painter(folder / "report.png")
     beside = threading.Timer(TRACED, prepare_the_rest, args=(what,))

@@ -116,10 +116,10 @@ def run(options: argparse.Namespace) -> int:
 
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:
     """`replay --compare`."""
-    from countersteer.simulator import keep_programs
+    from countersteer.compiling import configure_jax
     from countersteer.tuning.compare import compare, draw_comparison
 
-    keep_programs()
+    configure_jax()
     horizon = None if options.horizon == "run" else read_horizon(options.horizon or "1.0")
     result, series = compare(run, car, horizon, options.dt)
     out = options.out or run.path

@@ -90,10 +90,10 @@ def run_turns(options: argparse.Namespace) -> int:
     """`trials turns`."""
     from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
     from countersteer.drivers.policy import load_policy
     from countersteer.experiments import open_turns
     from countersteer.runs.recorder import new_folder
-    from countersteer.simulator import keep_programs
 
     if options.runs:
         rows = [row for path in options.runs for row in open_turns.of_run(path)]
@@ -101,7 +101,7 @@ def run_turns(options: argparse.Namespace) -> int:
         title += f" and {len(options.runs) - 2} more" if len(options.runs) > 2 else ""
         folder = new_folder(options.out, "turns")
     else:
-        keep_programs(cores=os.cpu_count() or 1)
+        configure_jax(cores=os.cpu_count() or 1)
         car, turning = load_car(options.car, options.set), load_policy(options.driver).turning
         cars = load_population(options.cars) if options.cars else None
         charge = options.battery or (None if cars else (0.3, 1.0))

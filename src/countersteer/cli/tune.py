@@ -74,8 +74,8 @@ def add(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     """`tune`."""
     from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
     from countersteer.runs.run import read_run
-    from countersteer.simulator import keep_programs
     from countersteer.tuning.tune import other_floors
 
     if options.out.suffix != ".toml":
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
         options.out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out {options.out}: {error.strerror}") from None
-    keep_programs(blocks=True)
+    configure_jax(blocks=True)
     runs = [read_run(path) for path in options.runs]
     car, base = load_car(options.car), Path(options.car).stem
     if options.fit == "acceleration":

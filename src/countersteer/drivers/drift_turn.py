@@ -32,7 +32,7 @@ RESTS = (0.17, 1.0)  # sideslip and yaw rate (rad/s) under which a linked turn m
 AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
 
 
-class Memory(NamedTuple):
+class DriftTurnMemory(NamedTuple):
     """What the driver is about."""
 
     phase: Scalar
@@ -47,7 +47,7 @@ class Memory(NamedTuple):
     odd: Scalar  # by how much the last that was not believed differed, m
     odds: Scalar  # how many in a row agreed on that
     follows: Scalar  # how many readings in a row followed the one before
-    straight: straighten.Memory
+    straight: straighten.StraightenMemory
 
     @property
     def time(self) -> Scalar:
@@ -92,22 +92,24 @@ class DriftTurn:
     longest: Scalar = 1.2  # s that a phase of a turn may take
     phases = ("straight", "spin", "stop", "settle")
 
-    def reset(self, key: jax.Array) -> Memory:
+    def reset(self, key: jax.Array) -> DriftTurnMemory:
         """Straight ahead, a corridor's length away from the first corner."""
         gap = jnp.asarray(self.gaps)[0]
         first = (STRAIGHT, 0, 0.0, 0.0, 1.0, 0.0, gap, DOUBT**2, math.inf, 0.0, 0, 0)
-        return Memory(*first, self.straight.reset(key))
+        return DriftTurnMemory(*first, self.straight.reset(key))
 
-    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+    def act(
+        self, memory: DriftTurnMemory, observation: Observation
+    ) -> tuple[Command, DriftTurnMemory]:
         """One control period."""
         return paced(self.think, memory, observation)
 
-    def status(self, memory: Memory) -> Status:
+    def status(self, memory: DriftTurnMemory) -> Status:
         """The turn and its phase, and where it believes to be in its corridor."""
         told = self.straight.status(memory.straight)
         return told._replace(turn=memory.turn, phase=memory.phase, doubts=memory.odds)
 
-    def think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+    def think(self, memory: DriftTurnMemory, seen: Observation) -> tuple[Command, DriftTurnMemory]:
         """The command from now on, and the memory with what is new."""
         now, own = seen.time, self.turning
         dt = now - memory.time
@@ -172,7 +174,7 @@ class DriftTurn:
         limit = self.straight.limit
         command = Command(jnp.clip(throttle, -1.0, 1.0), jnp.clip(steering, -limit, limit))
         integral = jnp.where(phase == STRAIGHT, straight.integral, 0.0)
-        return command, Memory(
+        return command, DriftTurnMemory(
             phase,
             memory.turn + begins,
             jnp.where(changed, now, memory.since),
@@ -186,7 +188,7 @@ class DriftTurn:
         )
 
     def _approach(
-        self, memory: Memory, seen: Observation, error: Scalar, angle: Scalar, dt: Scalar
+        self, memory: DriftTurnMemory, seen: Observation, error: Scalar, angle: Scalar, dt: Scalar
     ) -> tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]:
         """Distance to the next corner and its variance: odometry, and the wall ahead.
 

@@ -17,7 +17,7 @@ RUN_UP = 0.3  # s straight ahead before the wheels turn over
 AHEAD, SPIN, STOP = 0, 1, 2
 
 
-class Memory(NamedTuple):
+class OpenTurnMemory(NamedTuple):
     """What the driver is about."""
 
     phase: Scalar
@@ -42,12 +42,14 @@ class OpenTurn:
     limit: Scalar  # of steering, rad
     run_up: Scalar = RUN_UP  # s
 
-    def reset(self, key: jax.Array) -> Memory:
+    def reset(self, key: jax.Array) -> OpenTurnMemory:
         """Straight ahead."""
         del key
-        return Memory(AHEAD, 0.0, 0)
+        return OpenTurnMemory(AHEAD, 0.0, 0)
 
-    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+    def act(
+        self, memory: OpenTurnMemory, observation: Observation
+    ) -> tuple[Command, OpenTurnMemory]:
         """One control period."""
         estimate, now = observation.estimate, observation.time
         rate = self.hand * estimate.yaw_rate
@@ -66,9 +68,9 @@ class OpenTurn:
             jnp.clip(jnp.where(ahead, held, throttle), -1.0, 1.0),
             jnp.where(ahead, 0.0, jnp.clip(self.hand * steering, -self.limit, self.limit)),
         )
-        return command, Memory(phase, spun, jnp.where(phase == AHEAD, 0, 1))
+        return command, OpenTurnMemory(phase, spun, jnp.where(phase == AHEAD, 0, 1))
 
-    def status(self, memory: Memory) -> Status:
+    def status(self, memory: OpenTurnMemory) -> Status:
         """The turn, once it has begun."""
         return Status(memory.turn, memory.phase)
 

@@ -64,7 +64,7 @@ class Policies(NamedTuple):
     steering: Array  # rad
 
 
-class Memory(NamedTuple):
+class SequenceMemory(NamedTuple):
     """What the driver is about."""
 
     number: Scalar  # of the policy that holds
@@ -76,8 +76,8 @@ class Memory(NamedTuple):
     driven: Scalar  # m since
     stirred: Scalar  # whether the yaw rate was above its limit since
     along: Scalar  # distance along the centre line, m
-    echo: spikes.Memory
-    drift: drift_turn.Memory  # with what is known of the corridor
+    echo: spikes.SpikeMemory
+    drift: drift_turn.DriftTurnMemory  # with what is known of the corridor
 
     @property
     def time(self) -> Scalar:
@@ -91,7 +91,7 @@ class Memory(NamedTuple):
 
 
 @pytree
-class Plan:
+class PolicySequence:
     """Policies in their order; where the pose tells another's place, that one takes over.
 
     The one after the last is the first where the course is closed; else the last holds to the end.
@@ -109,22 +109,24 @@ class Plan:
         """What keeps to the corridor's middle."""
         return self.drift.straight
 
-    def reset(self, key: jax.Array) -> Memory:
+    def reset(self, key: jax.Array) -> SequenceMemory:
         """Before the first policy has begun."""
-        none = spikes.Memory(math.inf, math.inf, 0)
+        none = spikes.SpikeMemory(math.inf, math.inf, 0)
         start = self.line.start
         first = (0, 0, 0, 0.0, 0.0, start, 0.0, 0, start, none)
-        return Memory(*first, self.drift.reset(key))
+        return SequenceMemory(*first, self.drift.reset(key))
 
-    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+    def act(
+        self, memory: SequenceMemory, observation: Observation
+    ) -> tuple[Command, SequenceMemory]:
         """One control period."""
         return paced(self._think, memory, observation)
 
-    def status(self, memory: Memory) -> Status:
+    def status(self, memory: SequenceMemory) -> Status:
         """The turns that it has begun, and where it believes to be in its corridor."""
         return self.drift.status(memory.drift)._replace(turn=memory.turn)
 
-    def _think(self, memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+    def _think(self, memory: SequenceMemory, seen: Observation) -> tuple[Command, SequenceMemory]:
         dt, estimate = seen.time - memory.time, seen.estimate
         here = self.line.find(estimate.x, estimate.y, memory.along)
         speed = jnp.sqrt(estimate.vx**2 + estimate.vy**2 + 1e-12)
@@ -187,7 +189,7 @@ class Plan:
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[number], self.policies)
 
     def _next(
-        self, memory: Memory, own: Policies, seen: Observation, here: Place
+        self, memory: SequenceMemory, own: Policies, seen: Observation, here: Place
     ) -> tuple[Scalar, Scalar]:
         """The policy from now on, and whether it begins now."""
         until, estimate, count = own.until, seen.estimate, len(self.policies.does)
@@ -237,7 +239,9 @@ class Plan:
         near = jnp.mod(distance - begin + ASTRAY, whole) <= extent + 2 * ASTRAY
         return everywhere | near, ~everywhere & inside
 
-    def _heard(self, memory: spikes.Memory, seen: Observation, dt: Scalar) -> spikes.Memory:
+    def _heard(
+        self, memory: spikes.SpikeMemory, seen: Observation, dt: Scalar
+    ) -> spikes.SpikeMemory:
         """What is ahead by the front sonar, without spikes."""
         heard = seen.sonar[self.drift.front]
         tick = jnp.where(heard.came(dt), memory.tick + 1, memory.tick)
@@ -298,7 +302,7 @@ def plan(
     read: Read,
     speed: float | None = None,
     laps: int = 1,
-) -> Plan:
+) -> PolicySequence:
     """For a course and a nominal car, from the tables of a file that is called `where`.
 
     `read` reads a file of commands; `speed` (m/s) is that of policies which name none. Raises
@@ -331,7 +335,7 @@ def plan(
     # Its corners are the plan's to tell.
     straight_on = dataclasses.replace(course, turns=(), closed=False)
     drift = drift_turn.drift_turn(straight_on, car, speed, laps, by="wall")
-    return Plan(
+    return PolicySequence(
         policies=jax.tree.map(lambda *leaves: np.stack(leaves), *padded),
         drift=dataclasses.replace(drift, linked=1.0),
         line=line_of(course),
@@ -357,7 +361,7 @@ def is_plan(name: str) -> bool:
 
 def load_plan(
     name: str, course: Course, car: Car, read: Read, speed: float | None = None, laps: int = 1
-) -> Plan:
+) -> PolicySequence:
     """A plan from the library or a file."""
     tables, where = read_toml(name, LIBRARY, "driver")
     if tables.get("kind") != "plan":

@@ -20,7 +20,7 @@ SPEED = 1.5  # m/s, unless another is asked for
 DOUBT = math.radians(0.5)  # of the angle between two corridors
 
 
-class Memory(NamedTuple):
+class StraightenMemory(NamedTuple):
     """Where the car is in its corridor."""
 
     offset: Scalar  # left of the middle, m
@@ -85,25 +85,27 @@ class Straighten:
     throttle_p: Scalar = 0.25  # s/m
     blend: Scalar = 0.3  # part of a sonar's news that is believed at once, by sonar
 
-    def reset(self, key: jax.Array) -> Memory:
+    def reset(self, key: jax.Array) -> StraightenMemory:
         """In the middle of the corridor."""
         del key
         walls: Any = ()
         if self.by == "filter":
             walls = self.walls.initial_memory(heading=self.bearing, dtype=float)
-        return Memory(0.0, 0.0, 0.0, self.bearing, 0.0, walls, Command(0.0, 0.0))
+        return StraightenMemory(0.0, 0.0, 0.0, self.bearing, 0.0, walls, Command(0.0, 0.0))
 
-    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+    def act(
+        self, memory: StraightenMemory, observation: Observation
+    ) -> tuple[Command, StraightenMemory]:
         """Steers to the middle at the speed that was asked for."""
 
-        def think(memory: Memory, seen: Observation) -> tuple[Command, Memory]:
+        def think(memory: StraightenMemory, seen: Observation) -> tuple[Command, StraightenMemory]:
             memory = self.follow(memory, seen)
             command = self.command(memory, seen, self.speed)
             return command, memory._replace(command=command)
 
         return paced(think, memory, observation)
 
-    def status(self, memory: Memory) -> Status:
+    def status(self, memory: StraightenMemory) -> Status:
         """Where it believes to be in its corridor."""
         told = Status(memory.turned, 0, memory.offset, memory.error)
         if self.by == "filter":
@@ -113,7 +115,7 @@ class Straighten:
             )
         return told
 
-    def follow(self, memory: Memory, seen: Observation) -> Memory:
+    def follow(self, memory: StraightenMemory, seen: Observation) -> StraightenMemory:
         """The memory with what is new: also while something else steers."""
         dt = seen.time - memory.time
         walls: Any = ()
@@ -129,7 +131,7 @@ class Straighten:
         else:
             error = memory.error + seen.estimate.heading - memory.heading
             offset = self._heard(memory.offset, error, seen, dt)
-        return Memory(
+        return StraightenMemory(
             offset,
             error,
             jnp.clip(memory.integral + dt * offset, -0.1, 0.1),
@@ -154,7 +156,7 @@ class Straighten:
             offset = offset + jnp.where(news, self.blend * (at - offset), 0.0)
         return offset
 
-    def turned(self, memory: Memory, angle: Scalar, now: Scalar) -> Memory:
+    def turned(self, memory: StraightenMemory, angle: Scalar, now: Scalar) -> StraightenMemory:
         """Where `now`: in the corridor behind a corner, of whose middle nothing is known."""
         walls = memory.walls
         if self.by == "filter":
@@ -168,7 +170,7 @@ class Straighten:
         )
         return jax.tree.map(lambda new, old: jnp.where(now, new, old), beyond, memory)
 
-    def command(self, memory: Memory, seen: Observation, speed: Scalar) -> Command:
+    def command(self, memory: StraightenMemory, seen: Observation, speed: Scalar) -> Command:
         """PID, and the throttle that holds a speed."""
         aside = self.p * memory.offset + self.i * memory.integral
         steering = -(jnp.clip(aside, -self.steepest, self.steepest) + self.d * memory.error)

@@ -16,7 +16,7 @@ TRUST = 0.25  # part of the difference to the wheels' speed that a report of the
 FADE = 0.3  # s in which sideways speed is forgotten while the wheels roll
 
 
-class Memory(NamedTuple):
+class ReckoningMemory(NamedTuple):
     """The estimate, and the ticks of the reports that are already in it."""
 
     estimate: Estimate
@@ -25,15 +25,15 @@ class Memory(NamedTuple):
     encoder: Scalar
 
 
-def initial_memory(pose: tuple[float, float, float], dtype: np.dtype) -> Memory:
+def initial_memory(pose: tuple[float, float, float], dtype: np.dtype) -> ReckoningMemory:
     """At rest at a known pose."""
     x, y, heading, zero = (jnp.asarray(value, dtype) for value in (*pose, 0.0))
     estimate = Estimate(x, y, heading, zero, zero, zero)
     none = np.int32(0)
-    return Memory(estimate, none, none, none)
+    return ReckoningMemory(estimate, none, none, none)
 
 
-def update(memory: Memory, readings: Readings, dt: float) -> Memory:
+def update(memory: ReckoningMemory, readings: Readings, dt: float) -> ReckoningMemory:
     """Takes in what the readings have that is new.
 
     dvx/dt = ax + r vy and dvy/dt = ay - r vx between reports of the accelerometer, the heading
@@ -61,7 +61,7 @@ def update(memory: Memory, readings: Readings, dt: float) -> Memory:
         vy,
         rate,
     )
-    return Memory(
+    return ReckoningMemory(
         estimate,
         jnp.maximum(readings.gyroscope.tick, memory.gyroscope),
         jnp.maximum(readings.accel_x.tick, memory.accelerometer),
@@ -79,16 +79,18 @@ class DeadReckoning:
     takes_truth = False
     period = 0.0
 
-    def init(self, key: jax.Array) -> Memory:
+    def init(self, key: jax.Array) -> ReckoningMemory:
         """At rest at the start."""
         del key
         return initial_memory(self.start, jnp.result_type(self.start[0]))
 
-    def update(self, memory: Memory, readings: Readings, command: Command, tick: Scalar) -> Memory:
+    def update(
+        self, memory: ReckoningMemory, readings: Readings, command: Command, tick: Scalar
+    ) -> ReckoningMemory:
         """Takes in what the readings have that is new."""
         del command, tick
         return update(memory, readings, self.dt)
 
-    def estimate(self, memory: Memory) -> Estimate:
+    def estimate(self, memory: ReckoningMemory) -> Estimate:
         """What it has come to."""
         return memory.estimate

@@ -34,7 +34,7 @@ ROUGH = (0.01, 0.01, 0.005)  # m, m, rad by which a resampled particle differs f
 WIDER = 0.04  # and by this part of the whole cloud's deviation, so that a thin cloud searches
 
 
-class Memory(NamedTuple):
+class Cloud(NamedTuple):
     """The cloud: (particles,) each."""
 
     x: jax.Array
@@ -59,7 +59,7 @@ class Pose(NamedTuple):
 class Located(NamedTuple):
     """The cloud, what was best at its last step, and the velocity filter's estimate then."""
 
-    cloud: Memory
+    cloud: Cloud
     pose: Pose
     tick: Scalar  # of that step
 
@@ -71,7 +71,7 @@ class PoseFilter:
     walls: Array
     sonar: Sonar
 
-    def uniform(self, course: Course, key: jax.Array, particles: int, motion: Estimate) -> Memory:
+    def uniform(self, course: Course, key: jax.Array, particles: int, motion: Estimate) -> Cloud:
         """Anywhere in the corridor at any heading. Raises `ValueError` without a centre line."""
         if course.width is None:
             raise ValueError(f"{course.name}: free walls have no corridor to draw from")
@@ -91,7 +91,7 @@ class PoseFilter:
 
     def known(
         self, pose: tuple[Scalar, Scalar, Scalar], key: jax.Array, particles: int, motion: Estimate
-    ) -> Memory:
+    ) -> Cloud:
         """Around a pose, within 5 cm and 2°."""
         key, own = jax.random.split(key)
         dtype = self.walls.dtype
@@ -104,15 +104,13 @@ class PoseFilter:
 
     def memory(
         self, x: jax.Array, y: jax.Array, heading: jax.Array, motion: Estimate, key: jax.Array
-    ) -> Memory:
+    ) -> Cloud:
         """Particles of equal weight."""
         ticks = tuple(np.int32(0) for _ in self.sonar.mounts)
         weight = jnp.full_like(x, -math.log(len(x)))
-        return Memory(x, y, heading, weight, motion, ticks, key)
+        return Cloud(x, y, heading, weight, motion, ticks, key)
 
-    def update(
-        self, memory: Memory, sonar: tuple[Reading, ...], now: Estimate, h: Scalar
-    ) -> Memory:
+    def update(self, memory: Cloud, sonar: tuple[Reading, ...], now: Estimate, h: Scalar) -> Cloud:
         """The cloud after h seconds: moved with the velocity filter, weighed by what is new."""
         key, move_key, draw_key = jax.random.split(memory.key, 3)
         x, y, heading = self.moved(memory, now, h, move_key)
@@ -135,10 +133,10 @@ class PoseFilter:
         ticks = tuple(
             jnp.maximum(r.tick, tick) for r, tick in zip(sonar, memory.ticks, strict=True)
         )
-        return Memory(x, y, heading, weight, now, ticks, key)
+        return Cloud(x, y, heading, weight, now, ticks, key)
 
     def moved(
-        self, memory: Memory, now: Estimate, h: Scalar, key: jax.Array
+        self, memory: Cloud, now: Estimate, h: Scalar, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Each particle by the mean velocity of the step and the turn, and by what is uncertain."""
         before, root = memory.motion, jnp.sqrt(h)
@@ -207,7 +205,7 @@ class PoseFilter:
         return (*children, jnp.full_like(weight, -math.log(count)))
 
 
-def best(memory: Memory) -> Pose:
+def best(memory: Cloud) -> Pose:
     """The heaviest hypothesis: what lies `NEAR` the particle with the most weight around it.
 
     Among the 64 heaviest particles, the one whose surroundings weigh most is taken.

@@ -19,7 +19,7 @@ from countersteer.signals import Reading, Scalar
 SLACK = 4.0  # standard deviations of a reading by which it may be too short
 
 
-class Memory(NamedTuple):
+class SpikeMemory(NamedTuple):
     """Of one sonar."""
 
     believed: Scalar  # m, less what was driven since
@@ -27,12 +27,12 @@ class Memory(NamedTuple):
     tick: Scalar
 
 
-def initial_memory(dtype: np.dtype) -> Memory:
+def initial_memory(dtype: np.dtype) -> SpikeMemory:
     """Nothing heard."""
-    return Memory(dtype.type(np.inf), dtype.type(np.inf), np.int32(-1))
+    return SpikeMemory(dtype.type(np.inf), dtype.type(np.inf), np.int32(-1))
 
 
-def update(memory: Memory, reading: Reading, driven: Scalar, noise: Scalar) -> Memory:
+def update(memory: SpikeMemory, reading: Reading, driven: Scalar, noise: Scalar) -> SpikeMemory:
     """With a reading, if it is new; `driven` is how much nearer the car came at most since (m).
 
     A believed distance is that of the reading, or where this is a spike, of what it had to be.
@@ -43,7 +43,7 @@ def update(memory: Memory, reading: Reading, driven: Scalar, noise: Scalar) -> M
     # Too short for what was believed, and nothing like it was heard before.
     spike = reading.value < jnp.minimum(believed, heard) - slack
     taken = jnp.where(spike, believed, reading.value)
-    return Memory(
+    return SpikeMemory(
         jnp.where(fresh, taken, believed),
         jnp.where(fresh, reading.value, heard),
         jnp.where(fresh, reading.tick, memory.tick),

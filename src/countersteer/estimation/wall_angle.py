@@ -37,7 +37,7 @@ ROUNDING = 2e-5  # s, of a time in 32 bits
 CURVES = 0.03  # rad/m: deviation of the walls' bend in what the rooms call a straight
 
 
-class Memory(NamedTuple):
+class WallAngleMemory(NamedTuple):
     """The filter between two steps."""
 
     mean: tuple[Scalar, ...]
@@ -91,15 +91,17 @@ class WallAngle:
         angle: float = 0.0,
         heading: float = 0.0,
         dtype: type = np.float64,
-    ) -> Memory:
+    ) -> WallAngleMemory:
         """At the start of a straight."""
         none = tuple(0.0 for _ in self.mounts)
         return jax.tree.map(
             lambda value: jnp.asarray(value, dtype),
-            Memory((offset, angle, 0.0), diagonal(START), 0.0, heading, 0.0, none, none),
+            WallAngleMemory((offset, angle, 0.0), diagonal(START), 0.0, heading, 0.0, none, none),
         )
 
-    def turned(self, memory: Memory, angle: Scalar, doubt: Scalar = 0.03) -> Memory:
+    def turned(
+        self, memory: WallAngleMemory, angle: Scalar, doubt: Scalar = 0.03
+    ) -> WallAngleMemory:
         """The corridor beyond a corner of this angle: nothing is known of the offset there.
 
         `doubt` is what the corner adds to the angle's standard deviation (rad).
@@ -112,14 +114,14 @@ class WallAngle:
 
     def update(
         self,
-        memory: Memory,
+        memory: WallAngleMemory,
         sonar: Sequence[Reading | Any],
         ages: tuple[Scalar, ...],
         estimate: Estimate,
         time: Scalar,
         scan: Reading | Any | None = None,
         scan_age: Scalar = math.inf,
-    ) -> Memory:
+    ) -> WallAngleMemory:
         """With what the sonars have that is new: those readings whose age (s) is under a step's.
 
         A side's distance d is that to where its beam meets the wall nearest, so that
@@ -182,7 +184,7 @@ class WallAngle:
         # Long without a believed reading: rather believe too little than shut them all out.
         lost = jnp.where(time - believed > FORGETS, (0.3 * self.width) ** 2 * h, 0.0)
         covariance = predict(covariance, {}, {OFFSET: lost})
-        return Memory(
+        return WallAngleMemory(
             mean, covariance, time, estimate.heading, believed, tuple(last), tuple(repeats)
         )
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from countersteer.batch.open_drives import batch, commands, drives
-from countersteer.batch.rollout import LANES
+from countersteer.batch.engine import LANES
+from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
 from countersteer.drivers.replay import Replay
@@ -45,7 +45,7 @@ def _found(
 ) -> Found:
     charge, wear = (grid.ravel() for grid in np.meshgrid(CHARGES, WEARS, indexing="ij"))
     count = len(charge)
-    cars = changed(batch(car, count), "battery.wear", wear.astype(np.float32))
+    cars = changed(repeated(car, count), "battery.wear", wear.astype(np.float32))
     sampled = drives(
         cars, charge.astype(np.float32), [driver] * count, np.zeros((count, 3)), longest,
         report=report, lanes=lanes,

@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from countersteer.batch.engine import LANES
 from countersteer.batch.evaluate import interval
 from countersteer.batch.population import draw, load_population
-from countersteer.batch.rollout import LANES, rollouts
+from countersteer.batch.trials import run_trials
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed, pytree
 from countersteer.course.course import Course, from_segments
@@ -37,7 +38,7 @@ LONGEST = 8.0  # s of a trial
 BATTERIES = {"first": (1.0, 0.0), "last": (0.3, 1.0)}  # charge, wear
 
 
-class Memory(NamedTuple):
+class OpenLoopMemory(NamedTuple):
     """Of the driver within, and when the turn began (s)."""
 
     inner: Any
@@ -53,15 +54,17 @@ class OpenLoop:
     throttle: np.ndarray  # each `STEP` seconds from the turn's beginning
     steering: np.ndarray  # rad
 
-    def reset(self, key: jax.Array) -> Memory:
+    def reset(self, key: jax.Array) -> OpenLoopMemory:
         """Before the turn."""
-        return Memory(self.inner.reset(key), 0, math.inf)
+        return OpenLoopMemory(self.inner.reset(key), 0, math.inf)
 
-    def status(self, memory: Memory) -> Status:
+    def status(self, memory: OpenLoopMemory) -> Status:
         """That of the driver within."""
         return self.inner.status(memory.inner)
 
-    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+    def act(
+        self, memory: OpenLoopMemory, observation: Observation
+    ) -> tuple[Command, OpenLoopMemory]:
         """The recorded command in the turn, else the inner driver's."""
         now = observation.time
         command, inner = self.inner.act(memory.inner, observation)
@@ -79,7 +82,7 @@ class OpenLoop:
             jnp.where(playing, throttle, command.throttle),
             jnp.where(playing, steering, command.steering),
         )
-        return command, Memory(inner, turn, begun)
+        return command, OpenLoopMemory(inner, turn, begun)
 
 
 def corner(width: float = 1.4, name: str = "corner") -> Course:
@@ -131,7 +134,7 @@ def simulate(
         cars = changed(drawn.cars, "battery.wear", np.full(trials, wear, np.float32))
         driver: Any = closed if loop == "closed" else open_loop
         pilot = Pilot.of(driver, course, car, link=LINKS[link])
-        score = rollouts(
+        score, _ = run_trials(
             course,
             pilot,
             drawn._replace(cars=cars),

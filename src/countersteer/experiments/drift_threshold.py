@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from countersteer.batch.engine import LANES
 from countersteer.batch.evaluate import DRIFT
-from countersteer.batch.open_drives import batch, commands, drives
-from countersteer.batch.rollout import LANES
+from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.errors import InputError
 from countersteer.experiments.found import Found, Report, silent
@@ -36,7 +36,7 @@ def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -
     velocity = np.stack([speed, still, still], axis=1)
     charge = np.ones(len(lock), np.float32)
     sampled = drives(
-        batch(car, len(lock)), charge, drivers, velocity, DRIVE, report=report, lanes=lanes
+        repeated(car, len(lock)), charge, drivers, velocity, DRIVE, report=report, lanes=lanes
     )
     m = sampled.motion
     at = round(0.1 / (sampled.time[1] - sampled.time[0]))

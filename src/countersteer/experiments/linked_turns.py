@@ -14,16 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.batch.population import draw, load_population
-from countersteer.batch.rollout import watched
+from countersteer.batch.trials import Instant, run_trials
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course, Turn
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.experiments.found import Found, Report, silent
-from countersteer.pilot import Memory, Pilot
+from countersteer.pilot import Pilot
 from countersteer.signals import Scalar
-from countersteer.simulator import Loop, Simulator
-from countersteer.task.task import Score
 from countersteer.task.turns import ROUNDING, STRAIGHT_FOR, goes_straight
 
 TRIALS = 1000
@@ -45,26 +43,16 @@ class Kept(NamedTuple):
 class LastTurn:
     """Looks at the heading behind the driver's last turn: no corridor tells where it ends."""
 
-    def begin(self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory) -> Kept:
+    def begin(self, now: Instant) -> Kept:
         """Nothing yet."""
-        del pilot, memory
-        zero = jnp.zeros_like(simulator.world.motion(loop.state).x)
+        zero = jnp.zeros_like(now.simulator.world.motion(now.loop.state).x)
         return Kept(zero, zero, zero + jnp.nan)
 
-    def look(
-        self,
-        simulator: Simulator,
-        pilot: Pilot,
-        loop: Loop,
-        memory: Memory,
-        score: Score,
-        kept: Kept,
-    ) -> Kept:
+    def look(self, now: Instant, kept: Kept) -> Kept:
         """One instant more."""
-        del score
-        motion = simulator.world.motion(loop.state)
-        time = simulator.dt * loop.tick.astype(motion.x.dtype)
-        turns, calm = pilot.status(memory).turn >= TURNS, goes_straight(motion)
+        motion = now.simulator.world.motion(now.loop.state)
+        time = now.simulator.dt * now.loop.tick.astype(motion.x.dtype)
+        turns, calm = now.pilot.status(now.memory).turn >= TURNS, goes_straight(motion)
         stirred = jnp.where(turns & ~calm, 1.0, kept.stirred)
         since = jnp.where(calm, kept.calm_since, time)
         ends = (stirred > 0) & calm & (time - since >= STRAIGHT_FOR - ROUNDING)
@@ -91,7 +79,7 @@ def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS)
     errors = {}
     for i, (label, carry) in enumerate((("carried over", 1.0), ("each by itself", 0.0))):
         driver = dataclasses.replace(drift_turn(course, car, SPEED), linked=1.0, carry=carry)
-        _, kept = watched(
+        _, kept = run_trials(
             course,
             Pilot.of(driver, course, car),
             drawn,

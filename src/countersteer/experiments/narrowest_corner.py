@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
+from countersteer.batch.engine import LANES
 from countersteer.batch.evaluate import DRIFT
-from countersteer.batch.open_drives import batch, drives
-from countersteer.batch.rollout import LANES
+from countersteer.batch.open_drives import drives, repeated
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import from_segments
@@ -48,7 +48,7 @@ SLIDE = ((1.2, 3.0), (0.0, 1.0), (-0.4, 1.15), (0.7, 1.6), (0.0, 1.0))
 AHEAD, TURN, STOP, SETTLE = 0, 1, 2, 3
 
 
-class Memory(NamedTuple):
+class CornerMemory(NamedTuple):
     """What the driver is about."""
 
     phase: Scalar
@@ -70,12 +70,12 @@ class Corner:
     limit: Scalar
     front_axle: Scalar
 
-    def reset(self, key: jax.Array) -> Memory:
+    def reset(self, key: jax.Array) -> CornerMemory:
         """Straight ahead."""
         del key
-        return Memory(AHEAD, 0.0)
+        return CornerMemory(AHEAD, 0.0)
 
-    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+    def act(self, memory: CornerMemory, observation: Observation) -> tuple[Command, CornerMemory]:
         """One control period."""
         seen, own = observation.estimate, self.turning
         speed = jnp.maximum(seen.vx, 0.5)
@@ -108,7 +108,7 @@ class Corner:
         throttle = jnp.where(slides, throttle, held)
         return Command(
             jnp.clip(throttle, 0.0, 1.0), jnp.clip(steering, -self.limit, self.limit)
-        ), Memory(phase, entry)
+        ), CornerMemory(phase, entry)
 
 
 class Tried(NamedTuple):
@@ -148,7 +148,7 @@ def attempt(car: Car, width: float, slides: bool, draws: int, lanes: int) -> Tri
     still = np.zeros(draws)
     pose = np.stack([3.0 - GATE + still, -room * free, still], axis=1)
     sampled = drives(
-        batch(car, draws),
+        repeated(car, draws),
         np.ones(draws, np.float32),
         drivers,
         np.stack([speed, still, still], axis=1),

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from countersteer.batch.open_drives import batch, drives
+from countersteer.batch.open_drives import drives, repeated
 from countersteer.batch.population import Population, draw
 from countersteer.car.car import Car
 from countersteer.drivers.open_turn import open_turn
@@ -153,7 +153,7 @@ def trial(
     where there is a population. The driver knows the nominal car.
     """
     count = len(seeds)
-    cars, charges, floor = batch(car, count), np.ones(count), None
+    cars, charges, floor = repeated(car, count), np.ones(count), None
     drawn = np.array([np.random.default_rng([seed, 1]).uniform(size=5) for seed in seeds])
     if population is not None:
         varied = draw(population, car, None, seeds, np.float32)

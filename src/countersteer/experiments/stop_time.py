@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from countersteer.batch.rollout import LANES
+from countersteer.batch.engine import LANES
 from countersteer.car.car import Car
 from countersteer.drivers.policy import library
 from countersteer.experiments import stop_regression

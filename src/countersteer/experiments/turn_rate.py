@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from countersteer.batch.open_drives import batch, commands, drives
-from countersteer.batch.rollout import LANES
+from countersteer.batch.engine import LANES
+from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.errors import InputError
@@ -46,7 +46,7 @@ def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -
     velocity = np.stack([speeds, still, still], axis=1)
     charge = np.ones(len(asked), np.float32)
     sampled = drives(
-        batch(car, len(asked)), charge, drivers, velocity, DRIVE, report=report, lanes=lanes
+        repeated(car, len(asked)), charge, drivers, velocity, DRIVE, report=report, lanes=lanes
     )
     end, m = sampled.time >= DRIVE - COUNTS, sampled.motion
     vx, vy, rate = (np.mean(v[:, end], axis=1) for v in (m.vx, m.vy, m.yaw_rate))

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from countersteer.batch.population import Population, draw
-from countersteer.batch.rollout import rollouts
+from countersteer.batch.trials import run_trials
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import drift_turn
@@ -134,7 +134,8 @@ def drive(
     many: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], drawn)
     pilot = Pilot.of(drivers[0], course, car)
     longest = (course.lap_end(1) or 0.0) / SLOWEST
-    return rollouts(course, pilot, many, drivers, [seeds[i] for i in rows], 1, longest)
+    drawn_seeds = [seeds[i] for i in rows]
+    return run_trials(course, pilot, many, drivers, drawn_seeds, 1, longest)[0]
 
 
 def _numbers(policy: Policy) -> list[tuple[str, Any]]:

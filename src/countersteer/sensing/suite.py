@@ -83,7 +83,7 @@ def due(every: Fraction, tick: Scalar) -> Scalar:
     return number(every, tick) != number(every, tick - 1)
 
 
-class Memory(NamedTuple):
+class SensorMemory(NamedTuple):
     """What the sensors carry from tick to tick."""
 
     readings: Readings
@@ -120,7 +120,7 @@ def position_slots(car: Car, dt: float) -> int:
     return round(float(np.max(car.sensors.position.delay)) / dt) + 1
 
 
-def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None) -> Memory:
+def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None) -> SensorMemory:
     """Sensors that have not reported yet. `slots` default to the car's `position_slots`."""
     dtype = jnp.result_type(motion.x).type
     zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
@@ -143,20 +143,20 @@ def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None
         pose = jnp.stack([motion.x, motion.y, motion.heading]).astype(dtype)
         poses = jnp.tile(pose, (slots, 1))
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
-    return Memory(readings, zero, zero, zero, velocity, eye, poses)
+    return SensorMemory(readings, zero, zero, zero, velocity, eye, poses)
 
 
 def sense(
     car: Car,
     walls: jax.Array,
     corners: jax.Array,
-    memory: Memory,
+    memory: SensorMemory,
     motion: Motion,
     root: jax.Array,
     tick: Scalar,
     every: Periods,
     dt: float,
-) -> Memory:
+) -> SensorMemory:
     """The sensors after a tick. Noise is drawn once a reading, from the drive's key `root`."""
     sensors, readings = car.sensors, memory.readings
     shaft = drivetrain.driven_speed(car, motion.wheels)

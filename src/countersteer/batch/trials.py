@@ -1,8 +1,8 @@
 """Many closed-loop drives at once, judged as they go.
 
-Each lane is a trial: its own car, start, noise and driver's numbers. Trials run in blocks, a block
-on each core, in pieces of car time; between pieces those that are over make room for the rest. A
-trial ends when its goal is reached and its last turn has ended, or when it can no longer succeed.
+Each lane is a trial with its own car, start, noise and driver's numbers. A trial ends when its goal
+is reached and its last turn has ended, or when it can no longer succeed. A block goes on until all
+its trials have ended.
 """
 
 import dataclasses
@@ -13,15 +13,16 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 
+from countersteer.batch import engine
 from countersteer.batch.population import Drawn
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
-from countersteer.pilot import Memory, Pilot
+from countersteer.pilot import Pilot, PilotMemory
 from countersteer.sensing import suite
 from countersteer.sensing.faults import Fault
 from countersteer.signals import Array, Scalar
@@ -30,11 +31,11 @@ from countersteer.task.task import PERIOD, Outcome, Sample, Score, Task
 from countersteer.world import planar
 from countersteer.world.floor import Floor
 
-LANES, FEW = 128, 16  # trials of a block; where there are no more, of a smaller one
+FEW = 16  # trials of a block where there are no more
 
 
-class Trials(NamedTuple):
-    """What a batch of trials runs with; leaves have an axis of trials in front."""
+class Trial(NamedTuple):
+    """What a trial has of its own; in a batch, leaves have an axis of trials in front."""
 
     car: Car
     driver: Any  # leaves that all trials share have no such axis
@@ -55,55 +56,52 @@ class Shared(NamedTuple):
     watch: Any = None
 
 
+class Instant(NamedTuple):
+    """A trial at one instant, before the judge's sample is taken."""
+
+    simulator: Simulator
+    pilot: Pilot
+    loop: Loop
+    memory: PilotMemory  # of the pilot
+    score: Score
+
+
 class Watch(Protocol):
-    """What looks on at trials beside the judge, in pytrees; a pytree itself, all trials share it.
+    """What looks on beside the judge, every `PERIOD`: a pytree that all trials share."""
 
-    What it keeps of a trial is looked at every `PERIOD`, before the judge's sample is taken.
-    """
-
-    def begin(self, simulator: Simulator, pilot: Pilot, loop: Loop, memory: Memory) -> Any:
-        """What is kept before the first tick."""
+    def begin(self, now: Instant) -> Any:
+        """What is kept before the first tick; a pytree."""
         ...
 
-    def look(
-        self,
-        simulator: Simulator,
-        pilot: Pilot,
-        loop: Loop,
-        memory: Memory,
-        score: Score,
-        kept: Any,
-    ) -> Any:
-        """What is kept with this instant; of no effect when the trial is over."""
+    def look(self, now: Instant, kept: Any) -> Any:
+        """What is kept with this instant. It has no effect once the trial is over."""
         ...
 
     def end(self, kept: Any) -> Any:
-        """What is given of it, as arrays."""
+        """The result, as arrays."""
         ...
 
 
 @partial(jax.jit, static_argnums=0)
-def _rollout(mesh: Mesh, shared: Shared, varied: Trials, driver: Any) -> tuple[Score, Any]:
+def _block(mesh: Mesh, own: Trial, driver: Any, shared: Shared) -> tuple[Score, Any]:
     """A block of trials on each core; `driver` holds None where the trials' drivers differ."""
-    cut, same = PartitionSpec("core"), PartitionSpec()
 
-    def on_core(shared: Shared, varied: Trials, driver: Any) -> tuple[Score, Any]:
-        def one(own: Trials) -> tuple[Score, Any]:
+    def on_core(own: Trial, driver: Any, shared: Shared) -> tuple[Score, Any]:
+        def one(own: Trial) -> tuple[Score, Any]:
             mine = jax.tree.map(
                 lambda a, b: b if a is None else a, driver, own.driver, is_leaf=lambda x: x is None
             )
             return _trial(shared, own._replace(driver=mine))
 
-        return jax.vmap(one, axis_name="trial")(varied)
+        return jax.vmap(one, axis_name="trial")(own)
 
-    run = jax.shard_map(
-        on_core, mesh=mesh, in_specs=(same, cut, same), out_specs=cut, check_vma=False
-    )
-    return run(shared, varied, driver)
+    run = engine.on_cores(on_core, mesh, (True, False, False))
+    found: tuple[Score, Any] = run(own, driver, shared)
+    return found
 
 
-def _trial(shared: Shared, own: Trials) -> tuple[Score, Any]:
-    """One trial; a block goes on until all its trials are over."""
+def _trial(shared: Shared, own: Trial) -> tuple[Score, Any]:
+    """One trial of a block."""
     task, watch = shared.task, shared.watch
     world: Any = shared.simulator.world
     simulator = dataclasses.replace(
@@ -119,18 +117,19 @@ def _trial(shared: Shared, own: Trials) -> tuple[Score, Any]:
     every = max(1, round(PERIOD / simulator.dt))
     loop, memory = begin(simulator), pilot.init(simulator.root)
 
-    def one(carry: tuple[Loop, Memory], _: None) -> tuple[tuple[Loop, Memory], None]:
+    def one(carry: tuple[Loop, PilotMemory], _: None) -> tuple[tuple[Loop, PilotMemory], None]:
         after = tick(simulator, pilot, *carry)
         return after[:2], None
 
-    kept = () if watch is None else watch.begin(simulator, pilot, loop, memory)
+    first = Instant(simulator, pilot, loop, memory, task.init())
+    kept = () if watch is None else watch.begin(first)
 
-    def look(carry: tuple[Loop, Memory, Score, Scalar, Any]) -> Any:
+    def look(carry: tuple[Loop, PilotMemory, Score, Scalar, Any]) -> Any:
         loop, memory, score, _, kept = carry
         if watch is not None:
-            told = watch.look(simulator, pilot, loop, memory, score, kept)
+            new = watch.look(Instant(simulator, pilot, loop, memory, score), kept)
             live = score.outcome == Outcome.DRIVING.code
-            kept = jax.tree.map(lambda new, old: jnp.where(live, new, old), told, kept)
+            kept = jax.tree.map(lambda new, old: jnp.where(live, new, old), new, kept)
         time = simulator.dt * loop.tick.astype(score.distance.dtype)
         motion, events = simulator.world.motion(loop.state), simulator.world.events(loop.state)
         turn = jnp.asarray(pilot.status(memory).turn)
@@ -140,18 +139,18 @@ def _trial(shared: Shared, own: Trials) -> tuple[Score, Any]:
         going = jax.lax.pmax((score.outcome == Outcome.DRIVING.code).astype(jnp.int32), "trial")
         return loop, memory, score, going, kept
 
-    def goes_on(carry: tuple[Loop, Memory, Score, Scalar, Any]) -> Any:
+    def goes_on(carry: tuple[Loop, PilotMemory, Score, Scalar, Any]) -> Any:
         return (carry[3] > 0) & (carry[0].tick <= shared.ticks)
 
-    first = (loop, memory, task.init(), jnp.int32(1), kept)
-    _, _, score, _, kept = jax.lax.while_loop(goes_on, look, first)
+    start = (loop, memory, first.score, jnp.int32(1), kept)
+    _, _, score, _, kept = jax.lax.while_loop(goes_on, look, start)
     late = score.outcome == Outcome.DRIVING.code
     return score._replace(outcome=jnp.where(late, jnp.int32(Outcome.LATE.code), score.outcome)), (
         () if watch is None else watch.end(kept)
     )
 
 
-def watched(
+def run_trials(
     course: Course,
     pilot: Pilot,
     drawn: Drawn,
@@ -165,10 +164,11 @@ def watched(
     faults: tuple[Fault, ...] = (),
     link: Link = ONBOARD,
 ) -> tuple[Score, Any]:
-    """One trial for each seed, its driver and what was drawn for it; and what `watch` has kept.
+    """One trial for each seed: its score, and what `watch` has kept (`()` without one).
 
-    `pilot` says how it is driven, but by whom. In the precision of the leaves of `drawn`. Leaves
-    of `faults` and of the result have an axis of trials in front.
+    Each seed has its row in `drawn` and its driver in `drivers`, which takes the place of the
+    pilot's own. The precision is that of the leaves of `drawn`. Leaves of `faults` and of the
+    result have an axis of trials in front. Raises `InputError` if the course has no goal.
     """
     if course.goal_distance is None:
         raise InputError("trials need a course with a goal")
@@ -191,7 +191,7 @@ def watched(
         np.int32(round(longest / pilot.dt)),
         watch,
     )
-    varied = Trials(
+    varied = Trial(
         drawn.cars,
         own,
         drawn.charge,
@@ -200,46 +200,22 @@ def watched(
         np.asarray(seeds, np.int32),
         jax.tree.map(dtype.type, faults),
     )
-    mesh = Mesh(np.array(jax.devices()), ("core",))
+    mesh = engine.all_cores()
     count = len(seeds)
-    width = (lanes or (FEW if count <= FEW * mesh.size else LANES)) * mesh.size
-    found = []
-    for first_row in range(0, count, width):
-        picked = np.arange(first_row, first_row + width) % count
+    width = (lanes or (FEW if count <= FEW * mesh.size else engine.LANES)) * mesh.size
+
+    def run(block: Trial, _: Callable[[float], None]) -> tuple[Score, Any]:
         with jax.enable_x64(dtype == np.float64):
-            results = _rollout(mesh, shared, _rows(varied, picked), common)
-        found.append(_rows(results, np.arange(min(width, count - first_row))))
-        report(min(first_row + width, count), count)
-    whole: tuple[Score, Any] = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+            found: tuple[Score, Any] = _block(mesh, block, common, shared)
+            return found
+
+    whole: tuple[Score, Any] = engine.in_turn(run, varied, width, report)
     return whole
-
-
-def rollouts(
-    course: Course,
-    pilot: Pilot,
-    drawn: Drawn,
-    drivers: Sequence[Driver],
-    seeds: Sequence[int],
-    laps: int,
-    longest: float,
-    report: Callable[[int, int], None] = lambda *_: None,
-    lanes: int | None = None,
-    link: Link = ONBOARD,
-) -> Score:
-    """`watched` with nobody looking on."""
-    return watched(
-        course, pilot, drawn, drivers, seeds, laps, longest, None, report, lanes, link=link
-    )[0]
 
 
 def _without(tree: Any, *names: str) -> Any:
     """The tree without parts that each trial has of its own."""
     return dataclasses.replace(tree, **dict.fromkeys(names))
-
-
-def _rows(tree: Any, picked: np.ndarray) -> Any:
-    """The picked trials of a batch."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[picked], tree)
 
 
 def _common(drivers: Sequence[Driver], dtype: Any) -> tuple[Any, Any]:

@@ -1,0 +1,124 @@
+"""A batch of planar cars in random drives: what the bench steps."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.batch.engine import CACHED_LANES, whole_blocks
+from countersteer.bench.accuracy import DURATION, MANOEUVRES
+from countersteer.car.files import load_car
+from countersteer.course.files import load_course
+from countersteer.signals import Command, Wheels
+from countersteer.world import planar
+from countersteer.world.state import State
+from countersteer.world.walls import padded
+
+# In a block each delay line has its slots first: each slot's lanes lie side by side.
+MOTION: Any = 0  # an axis stands for all of a motion
+AXES = State(MOTION, 1, 1, 0, 0, 0, 0, 0)
+
+
+def advance(
+    own: tuple[Any, State, Command],
+    same: Any,
+    walls: Any,
+    first: Any,
+    dt: float,
+    ticks: int,
+) -> State:
+    """A block's states after so many ticks, each lane with its own command; plain `vmap`.
+
+    `own` holds each lane's `Car`, state and command. Where the car is None, it is `same` for all.
+    """
+    car, states, commands = own
+    axes = (None if car is None else 0, None, AXES, 0, None, None)
+    step = jax.vmap(planar.step, axes, AXES)
+
+    def turned(states: State) -> State:
+        return states._replace(
+            throttle_line=states.throttle_line.T, steering_line=states.steering_line.T
+        )
+
+    last, _ = jax.lax.scan(
+        lambda states, count: (
+            step(same if car is None else car, walls, states, commands, count, dt),
+            None,
+        ),
+        turned(states),
+        first + jnp.arange(ticks, dtype=jnp.int32),
+    )
+    return turned(last)
+
+
+class Fleet:
+    """Cars in random drives on box: the inputs of a batch."""
+
+    def __init__(
+        self,
+        cars: int,
+        cores: int,
+        varied: bool = False,
+        block: int | None = None,
+        dt: float = 0.001,
+    ):
+        """At least so many cars, in whole blocks on each core; `varied`: each another car."""
+        self.dt, self.varied = dt, varied
+        self.cars = cars = whole_blocks(cars, block or CACHED_LANES, cores)
+        rng = np.random.default_rng(0)
+        course, car = load_course("box"), load_car("rx7")
+        car = jax.tree.map(np.float32, car)
+        start = planar.initial_state(car, dt, course.start)
+        self.states = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], cars, 0), start)
+        # Anywhere on the corridor's first side, about along it.
+        speed = rng.uniform(0.0, 3.0, cars).astype(np.float32)
+        rolling = [speed / tire.radius for tire in planar.tires_by_wheel(car)]
+        motion = self.states.motion._replace(
+            wheels=Wheels(*rolling),
+            x=rng.uniform(0.0, 3.0, cars).astype(np.float32),
+            y=rng.uniform(-0.4, 0.4, cars).astype(np.float32),
+            heading=rng.uniform(-0.5, 0.5, cars).astype(np.float32),
+            vx=speed,
+        )
+        self.states = self.states._replace(motion=motion)
+        self.commands = Command(
+            rng.uniform(0.0, 1.0, cars).astype(np.float32),
+            rng.uniform(-0.5, 0.5, cars).astype(np.float32),
+        )
+        self.walls = padded(course.walls, np.dtype(np.float32))
+        if varied:  # downwards: a differential that is locked must not get beyond it
+            car = jax.tree.map(lambda p: (p * rng.uniform(0.95, 1.0, cars)).astype(np.float32), car)
+        self.car = car
+        self.states, self.commands, self.car = jax.tree.map(
+            jnp.asarray, (self.states, self.commands, self.car)
+        )
+
+    def compiled(self, program: Any) -> Any:
+        """The program for these inputs."""
+        return program.lower(*self.inputs()).compile()
+
+    def inputs(self) -> tuple[Any, ...]:
+        """The arguments of `advance`."""
+        return self._inputs(self.states, self.commands, self.walls, 0)
+
+    def _inputs(self, states: State, commands: Command, walls: Any, first: int) -> tuple[Any, ...]:
+        own, same = (self.car, None) if self.varied else (None, self.car)
+        return (own, states, commands), same, walls, np.int32(first)
+
+    def call(self, program: Any) -> Callable[[], Any]:
+        """One run of it from the start."""
+        return lambda: jax.block_until_ready(program(*self.inputs()))
+
+    def manoeuvres(self, program: Any, ticks: int) -> list[list[float]]:
+        """Where (x and y, m) the lanes are at the end of the manoeuvres of docs/accuracy.md."""
+        begins = [planar.initial_state(self.car, self.dt, velocity=m.velocity) for m in MANOEUVRES]
+        lanes = np.arange(self.cars) % len(begins)
+        states = jax.tree.map(lambda *leaves: np.stack(leaves)[lanes].astype(np.float32), *begins)
+        asked = np.array([m.command for m in MANOEUVRES], np.float32)[lanes].T
+        walls = np.full_like(self.walls, np.nan)
+        for first in range(0, round(DURATION / self.dt), ticks):
+            states = program(*self._inputs(states, Command(*asked), walls, first))
+        motion = states.motion
+        return [[float(motion.x[i]), float(motion.y[i])] for i in range(len(begins))]
