@@ -23,11 +23,12 @@ from countersteer.batch.population import Drawn, draw, load_population
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
+from countersteer.course.along import legs_of
 from countersteer.course.course import Course
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
-from countersteer.drivers.straighten import lane, straighten
+from countersteer.drivers.straighten import straighten
 from countersteer.estimation.pose import PoseFilter
 from countersteer.link.link import ONBOARD
 from countersteer.sensing.faults import KINDS, Fault
@@ -73,9 +74,9 @@ def rms(values: Any) -> float:
 
 def errors(course: Course, car: Car, seeds: Sequence[int], make: Make = drift_turn) -> Any:
     """Scores, and what `watches.Errors` has kept, of one drive for each seed."""
-    lines = jax.tree.map(np.float32, lane(course))
+    legs = jax.tree.map(np.float32, legs_of(course, 1))
     sonar = jax.tree.map(np.float32, car.sensors.sonar)
-    watch = Errors(lane=lines, sonar=sonar, inside=np.float32(chi2.ppf(0.95, 3)))
+    watch = Errors(legs=legs, sonar=sonar, inside=np.float32(chi2.ppf(0.95, 3)))
     return trials(course, car, seeds).run_watched(partial(make, course, car), watch)
 
 

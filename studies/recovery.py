@@ -29,7 +29,6 @@ from countersteer.runs.run import Run, read_run
 from countersteer.simulator import Simulator
 from countersteer.tuning import fit
 from countersteer.tuning.tune import read_logs
-from countersteer.tuning.windows import ENCODER_LAG
 
 BASE = "jetracer-tape"
 CARS = 20
@@ -76,11 +75,11 @@ def log(car: Car, folder: Path, rng: np.random.Generator) -> Run:
     about = about_run(simulator, pilot, None, "replay", BASE, 1, car, {"kind": "replay"})
     folder.mkdir()
     drive(Drive(simulator, pilot, None, about, DURATION), folder)
-    return measured(read_run(folder), float(car.sensors.encoder.update), rng)
+    return measured(read_run(folder), rng)
 
 
-def measured(run: Run, counted: float, rng: np.random.Generator) -> Run:
-    """The run as a log of a real car: noisy poses for the state, and readings as late as DART's."""
+def measured(run: Run, rng: np.random.Generator) -> Run:
+    """The run as a log of a real car: noisy poses for the state, and the encoder as it is."""
     assert run.truth is not None
     assert run.telemetry is not None
     poses = {"time_s": run.truth["time_s"][::CAPTURE_EVERY]}
@@ -88,7 +87,7 @@ def measured(run: Run, counted: float, rng: np.random.Generator) -> Run:
         true = run.truth[name][::CAPTURE_EVERY]
         poses[name] = true + noise * rng.normal(size=len(true))
     readings = {
-        "time_s": run.telemetry["time_s"] + ENCODER_LAG - counted / 2,
+        "time_s": run.telemetry["time_s"],
         "wheel_speed_mps": run.telemetry["wheel_speed_mps"],
     }
     return Run(run.path, run.about, run.commands, Table(readings), Table(poses))

@@ -15,9 +15,9 @@ from countersteer import streams
 from countersteer.batch.trials import Instant
 from countersteer.car.car import Sonar
 from countersteer.car.parameter import pytree
+from countersteer.course.along import Legs
 from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import STRAIGHT
-from countersteer.drivers.straighten import Lane
 from countersteer.estimation import dead_reckoning, pose, spikes
 from countersteer.estimation.estimate import Estimate
 from countersteer.signals import Array, Scalar
@@ -68,7 +68,7 @@ class Kept(NamedTuple):
 class Errors:
     """Errors of what the driver is told, in a loop whose estimate is the velocity filter."""
 
-    lane: Lane
+    legs: Legs
     sonar: Sonar  # the nominal car's
     inside: Scalar  # 95 % of a chi-squared distribution with three degrees of freedom
 
@@ -113,7 +113,7 @@ class Errors:
         squares = kept.squares.at[place].set(jnp.where(fills, normal, kept.squares[place]))
 
         own = now.pilot.status(now.memory)
-        offset, angle, _ = self.lane.place(jnp.asarray(own.turn), motion)
+        _, offset, angle = self.legs.seen(jnp.asarray(own.turn), motion.x, motion.y, motion.heading)
         goes_on = own.phase == STRAIGHT
         straight = jnp.where(warm & goes_on & (jnp.abs(angle) < 0.3), 1.0, 0.0)
         offset_error, angle_error = (own.offset - offset) ** 2, (own.angle - angle) ** 2

@@ -18,9 +18,9 @@ from countersteer.tuning.acceleration import (
     NEVER_MOVES,
     PARAMETER,
     Acceleration,
-    draw_acceleration,
     fit_acceleration,
 )
+from countersteer.viewing.acceleration import draw_acceleration
 
 WALL = 'name = "wall"\nwalls_m = [[[4.0, -1.5], [4.0, 1.5]]]\n[start]\nx_m = 0.6\ny_m = 0.0\n'
 LEVELS = (0.03, 0.25, 0.3, 0.36, 0.42, 0.5, 0.58, 0.66, 0.8, 1.0)  # the first moves no car

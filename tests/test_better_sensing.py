@@ -11,10 +11,10 @@ from scipy.stats import chi2
 from countersteer.batch.population import draw, load_population
 from countersteer.batch.trials import run_trials
 from countersteer.car.files import load_car
+from countersteer.course.along import legs_of
 from countersteer.course.course import from_segments
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
-from countersteer.drivers.straighten import lane
 from countersteer.estimation import lidar_walls
 from countersteer.estimation.kalman import diagonal
 from countersteer.pilot import Pilot
@@ -84,7 +84,9 @@ def test_whoever_is_told_the_truth_makes_no_errors():
     course, car, seeds = load_course("box"), load_car("rx7"), range(4)
     drawn = draw(load_population("around"), car, course, seeds, np.float64)
     driver = drift_turn(course, car)
-    watch = Errors(lane=lane(course), sonar=car.sensors.sonar, inside=float(chi2.ppf(0.95, 3)))
+    watch = Errors(
+        legs=legs_of(course, 1), sonar=car.sensors.sonar, inside=float(chi2.ppf(0.95, 3))
+    )
     pilot = Pilot.of(driver, course, car, "truth")
     score, kept = run_trials(course, pilot, drawn, [driver] * 4, seeds, 1, 12.0, watch, lanes=4)
     assert np.all(score.outcome == Outcome.REACHED.code)

@@ -13,16 +13,18 @@ from countersteer.runs.importers.dart import POINT_X, POINT_Y, import_dart
 from countersteer.runs.run import Run, read_run
 from countersteer.signals import TRUTH
 from countersteer.tuning import windows
-from countersteer.tuning.compare import Compared, compare, draw_comparison, sensed, slides
+from countersteer.tuning.compare import Compared, compare, sensed, slides
 from countersteer.tuning.windows import (
-    ENCODER_QUANTUM,
-    GYRO_LAG,
     Measured,
     Reference,
     Signal,
+    Timing,
+    encoder_timing,
+    gyro_timing,
     velocities,
     window_starts,
 )
+from countersteer.viewing.comparison import draw_comparison
 from countersteer.world import planar
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dart"
@@ -97,8 +99,10 @@ def test_the_gyroscope_agrees_with_motion_capture_at_the_lag_that_is_taken_off(i
         difference = telemetry["gyro_radps"] - 1.025 * rate.at(telemetry["time_s"] - lag)
         return float(np.sqrt(np.nanmean(difference**2)))
 
-    assert error(GYRO_LAG) < 0.1
-    assert error(GYRO_LAG) < min(error(GYRO_LAG - 0.03), error(GYRO_LAG + 0.03))
+    lag = gyro_timing(run).lag
+    assert lag > 0
+    assert error(lag) < 0.1
+    assert error(lag) < min(error(lag - 0.03), error(lag + 0.03))
 
 
 @needs_data
@@ -344,7 +348,7 @@ def test_velocities_from_poses_respect_gaps():
 
 def test_a_reading_shows_the_past_in_whole_steps():
     readings = Signal(np.arange(0, 3, 0.1), np.zeros(30))
-    reference = Reference(readings, sensor=True, lag=0.06, over=0.1, quantum=0.04)
+    reference = Reference(readings, Timing(lag=0.06, over=0.1, step=0.04))
     time = np.arange(1.0, 2.001, 0.001)
     read = sensed(reference, time, time - 1.0, np.array([1.5, 2.0]), False)
     np.testing.assert_allclose(read, [0.44, 0.92 + 0.04 * 0.5], atol=0.0201)
@@ -357,7 +361,7 @@ def test_windows_start_where_the_dead_man_switch_is_closed_and_the_car_moves():
     speed = Signal(time, np.where(time > 1.2, 1.0, 0.0))
     still = Signal(time, np.zeros(60))
     armed = Signal(time, np.where((time > 0.85) & (time < 3.95), 1.0, 0.0))
-    measured = Measured(speed, still, still, None, None, None, armed)
+    measured = Measured(speed, still, still, None, None, Timing(), None, Timing(), armed)
     commands = Table(time_s=time, throttle=throttle, steering=0 * time)
     starts, resting = window_starts(measured, commands, 1000, 0.001)
     np.testing.assert_array_equal(starts, [1000, 1250, 1500, 1750, 2000, 2250, 2500, 2750])
@@ -381,8 +385,9 @@ def test_a_real_drift_is_compared_in_all_four_quantities(imported):
 
 @needs_data
 def test_a_straight_step_is_compared_by_its_sensors(imported, car):
-    result, series = compare(imported(STEP), car, 1.0, 0.001)
+    run = imported(STEP)
+    result, series = compare(run, car, 1.0, 0.001)
     assert list(result["rmse"]) == ["yaw_rate_radps", "wheel_speed_mps"]
     assert result["rmse"]["wheel_speed_mps"] < 1.0
-    steps = series["windows"][0]["wheel_speed_mps"].simulated / ENCODER_QUANTUM
+    steps = series["windows"][0]["wheel_speed_mps"].simulated / encoder_timing(run, car).step
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)

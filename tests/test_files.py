@@ -24,6 +24,7 @@ from countersteer.completion import every_action, script
 from countersteer.course.course import grip_speed, place, progress
 from countersteer.course.files import library as courses
 from countersteer.course.files import load_course
+from countersteer.drivers import DRIVERS
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
@@ -352,7 +353,7 @@ echo "${COMPREPLY[@]}"
 def completions(tmp_path_factory):
     """What bash offers for the last word of a command."""
     folder = tmp_path_factory.mktemp("completion")
-    (folder / "completion").write_text(script(cli.parser(), "bash", cli.DRIVERS))
+    (folder / "completion").write_text(script(cli.parser(), "bash", DRIVERS))
     (folder / "my car.toml").write_text("")
 
     def offered(*words: str) -> str:
@@ -389,7 +390,7 @@ def test_bash_completes(words, offered, completions):
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
 def test_other_shells_take_their_script(shell, tmp_path):
-    text = script(cli.parser(), shell, cli.DRIVERS)
+    text = script(cli.parser(), shell, DRIVERS)
     for word in ("drive", "estimate", "rx7", "box", "drift-turn", "battery.wear="):
         assert word in text
     if shutil.which(shell):

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "countersteer"
 
-EVERYONE = {"errors", "text", "progress", "signals", "streams"}
+EVERYONE = {"errors", "text", "progress", "signals", "streams", "compiling"}
 MAY_IMPORT = {
     "car": set(),
     "course": {"car"},
@@ -46,7 +46,10 @@ MAY_IMPORT = {
         "car", "course", "world", "pilot", "simulator", "batch",
         "drivers",  # it times a drive, so it needs one that drives
     },
-    "viewing": {"car", "runs", "task", "world"},  # a car is drawn to its size, with its forces
+    "viewing": {
+        "car", "runs", "task", "world",  # a car is drawn to its size, with its forces
+        "batch", "tuning",  # what came of trials and of fits
+    },
     "listing": {"car", "course"},
     "completion": {"car", "course"},
     "cli": None,

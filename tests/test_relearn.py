@@ -87,7 +87,7 @@ def test_what_sets_new_runs_apart_is_their_error_and_not_what_was_driven(runs):
 
 def test_pieces_follow_the_time_and_share_the_windows(runs):
     old = read(runs["old"])
-    piece = relearn.pieces(old.run, old.start)
+    piece = relearn.pieces_of_time(old.run, old.start)
     assert np.ptp(np.bincount(piece, minlength=relearn.PIECES)) <= 1
     order = np.lexsort((old.start, old.run))
     assert np.all(np.diff(piece[order]) >= 0)

@@ -22,7 +22,6 @@ from countersteer.cli import (
 )
 from countersteer.cli.options import (
     DONE,
-    DRIVERS,
     FAILED,
     INTERRUPTED,
     WRONG_INPUT,
@@ -32,7 +31,7 @@ from countersteer.cli.options import (
 )
 from countersteer.errors import InputError
 
-__all__ = ["DONE", "DRIVERS", "FAILED", "INTERRUPTED", "WRONG_INPUT", "Progress", "entry", "main"]
+__all__ = ["DONE", "FAILED", "INTERRUPTED", "WRONG_INPUT", "Progress", "entry", "main"]
 
 VERBS = (
     drive, evaluate, replay, importing, trials, experiment, learn, tune, export, bench, listing,

@@ -4,7 +4,6 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from countersteer.cli.options import (
-    DRIVERS,
     SPEEDS,
     Verbs,
     laps_and_link,
@@ -12,6 +11,7 @@ from countersteer.cli.options import (
     physics,
 )
 from countersteer.cli.record import record
+from countersteer.drivers import DRIVERS
 from countersteer.errors import InputError
 
 if TYPE_CHECKING:

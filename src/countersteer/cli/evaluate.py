@@ -62,6 +62,7 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.link.link import LINKS
     from countersteer.runs.files import read_commands
     from countersteer.runs.recorder import new_folder
+    from countersteer.viewing.evaluation import draw_evaluation
 
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     course, car = load_course(options.course), load_car(options.car, options.set)
@@ -90,7 +91,8 @@ def run(options: argparse.Namespace) -> int:
     result = trials.about() | {"car": options.car, "drivers": found}
     (folder / "evaluate.json").write_text(json.dumps(result, indent=1) + "\n")
     picture = folder / "evaluate.png"
-    evaluate.picture(scores, f"{course.name}, {options.car}, {options.trials} trials", picture)
+    title = f"{course.name}, {options.car}, {options.trials} trials"
+    draw_evaluation(scores, title, picture)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
         return DONE

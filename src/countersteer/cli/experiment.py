@@ -5,20 +5,21 @@ import json
 import os
 from pathlib import Path
 
+from countersteer import experiments
 from countersteer.cli.options import DONE, Progress, Verbs, nominal_car
 from countersteer.errors import InputError
-
-EXPERIMENTS = (
-    "turn-rate", "drift-threshold", "stop-time", "drift-turn", "control-rate", "battery",
-    "linked-turns", "narrowest-corner",
-)  # fmt: skip
 
 
 def add(verbs: Verbs) -> None:
     """The verb with its options."""
     experiment = verbs.verb("experiment", "the paper's measurements", run)
     experiment.add_argument(
-        "name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS)
+        "name",
+        choices=tuple(experiments.NAMES),
+        metavar="NAME",
+        help="; ".join(f"{name}: {does}" for name, does in experiments.NAMES.items()).replace(
+            "%", "%%"
+        ),
     )
     nominal_car(experiment)
     experiment.add_argument(
@@ -35,7 +36,6 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`experiment`."""
-    from countersteer import experiments
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
     from countersteer.experiments.found import write

@@ -3,7 +3,8 @@
 import argparse
 import json
 
-from countersteer.cli.options import DONE, DRIVERS, Verbs, plans
+from countersteer.cli.options import DONE, Verbs, plans
+from countersteer.drivers import DRIVERS
 from countersteer.errors import InputError
 
 

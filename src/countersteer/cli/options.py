@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 __all__ = ["Progress"]  # and all else that is defined here
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
-DRIVERS = ("drift-turn", "straighten")
 Handler = Callable[[argparse.Namespace], int]
 
 

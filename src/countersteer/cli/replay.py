@@ -117,7 +117,8 @@ def run(options: argparse.Namespace) -> int:
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:
     """`replay --compare`."""
     from countersteer.compiling import configure_jax
-    from countersteer.tuning.compare import compare, draw_comparison
+    from countersteer.tuning.compare import compare
+    from countersteer.viewing.comparison import draw_comparison
 
     configure_jax()
     horizon = None if options.horizon == "run" else read_horizon(options.horizon or "1.0")

@@ -157,7 +157,8 @@ def tune_all(
 def tune_acceleration(options: argparse.Namespace, runs: list[Any], car: "Car") -> int:
     """The paper's adjuster: one parameter from steps of throttle."""
     from countersteer.car.files import save_car
-    from countersteer.tuning.acceleration import draw_acceleration, fit_acceleration
+    from countersteer.tuning.acceleration import fit_acceleration
+    from countersteer.viewing.acceleration import draw_acceleration
 
     found = fit_acceleration(runs, car, options.source, options.precision)
     about: dict[str, Any] = {

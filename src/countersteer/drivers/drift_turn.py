@@ -10,7 +10,6 @@ import numpy as np
 
 from countersteer.car.car import Car, Lidar
 from countersteer.car.parameter import pytree
-from countersteer.course.along import Legs, legs_of
 from countersteer.course.course import Course
 from countersteer.drivers import policy, straighten
 from countersteer.drivers.driver import Observation, Status, paced
@@ -84,7 +83,6 @@ class DriftTurn:
     width: Scalar
     cone: Scalar  # half-angle of the front sonar's cone, rad
     front: int = dataclasses.field(metadata={"static": True})
-    legs: Legs
     by: str = dataclasses.field(default="wall", metadata={"static": True})
     lidar: Lidar | None = None  # where the car has one, it looks for the corner instead
     carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
@@ -119,7 +117,7 @@ class DriftTurn:
         gap = jnp.asarray(self.gaps)[memory.turn + 1]
         corner, doubt, spikes = self._approach(memory, seen, straight.error, angle, dt)
         if self.by == "pose":
-            place = self.legs.seen(memory.turn, estimate.x, estimate.y, estimate.heading)
+            place = self.straight.legs.seen(memory.turn, estimate.x, estimate.y, estimate.heading)
             straight = straight._replace(offset=place.offset, error=place.bearing)
             corner = place.distance
 
@@ -203,7 +201,9 @@ class DriftTurn:
         corner = memory.corner - dt * along
         doubt = memory.doubt + dt * SLIPPING**2
         if self.straight.by == "pose":
-            corner = self.straight.lane.place(memory.turn, seen.estimate)[2]
+            pose = seen.estimate
+            place = self.straight.legs.seen(memory.turn, pose.x, pose.y, pose.heading)
+            corner = place.distance
             return corner, doubt, (memory.heard, memory.odd, memory.odds, memory.follows)
         heard = seen.sonar[self.front]
         came = heard.came(dt)
@@ -281,7 +281,6 @@ def drift_turn(
         width=width,
         cone=sonar.half_angle,
         front=front,
-        legs=legs_of(course, laps),
         by=by,
         lidar=car.sensors.lidar if car.sensors.lidar.beams else None,
     )

@@ -9,15 +9,13 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.car.files import read_toml
 from countersteer.course.course import Course
-from countersteer.drivers import plan, policy
+from countersteer.drivers import DRIVERS, plan, policy
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
-
-DRIVERS = ("drift-turn", "straighten")
 
 
 def make_driver(

@@ -6,15 +6,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
+from countersteer.course.along import Legs, legs_of
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.errors import InputError
 from countersteer.estimation.wall_angle import WallAngle, wall_angle
-from countersteer.signals import Array, Command, Scalar
+from countersteer.signals import Command, Scalar
 
 SPEED = 1.5  # m/s, unless another is asked for
 DOUBT = math.radians(0.5)  # of the angle between two corridors
@@ -33,32 +33,6 @@ class StraightenMemory(NamedTuple):
     turned: Scalar = 0  # corners that are behind
 
 
-class Lane(NamedTuple):
-    """Corridors by the number of corners that are behind: arrays of one number a corridor."""
-
-    x: Array  # a place on the middle line: the corner that the corridor ends in, m
-    y: Array
-    bearing: Array  # rad
-
-    def place(self, number: Scalar, estimate: Any) -> tuple[Scalar, Scalar, Scalar]:
-        """Of a pose in a corridor: offset to the left, angle, and distance to its end."""
-        bearing = jnp.asarray(self.bearing)[number]
-        cosine, sine = jnp.cos(bearing), jnp.sin(bearing)
-        dx = estimate.x - jnp.asarray(self.x)[number]
-        dy = estimate.y - jnp.asarray(self.y)[number]
-        return cosine * dy - sine * dx, estimate.heading - bearing, -cosine * dx - sine * dy
-
-
-def lane(course: Course, laps: int = 1) -> Lane:
-    """The corridors of a course from its start; the last ends at the goal."""
-    turns = course.turns_ahead(laps)
-    at = np.array([t.distance for t in turns] + [course.lap_end(laps) or course.start_distance])
-    if course.closed:
-        at = at % course.length
-    x, y = (np.interp(at, course.marks, course.line[:, i]) for i in (0, 1))
-    return Lane(x, y, course.start[2] + np.cumsum([0.0] + [t.angle for t in turns]))
-
-
 @pytree
 class Straighten:
     """PID between walls, and a speed held by the throttle.
@@ -67,7 +41,7 @@ class Straighten:
     offset's rate. Offset and angle are those of the wall filter (`by` "filter"); or, as the paper
     had it (`by` "sonar"), the offset comes from the side sonars, each by itself while it sees a
     wall of the corridor, and the angle from the gyroscope alone. With `by` "pose" both are those of
-    the estimate's pose in `lane`, for a car whose pose on the course is known.
+    the estimate's pose in `legs`, for a car whose pose on the course is known.
     """
 
     speed: Scalar  # m/s
@@ -76,7 +50,7 @@ class Straighten:
     hold: Scalar  # throttle per speed that holds it, s/m
     dead_zone: Scalar
     limit: Scalar  # of steering, rad
-    lane: Lane
+    legs: Legs
     by: str = dataclasses.field(default="filter", metadata={"static": True})
     p: Scalar = 1.2  # rad/m
     i: Scalar = 0.3  # rad/(m s)
@@ -127,7 +101,8 @@ class Straighten:
             )
             offset, error = walls.offset, walls.angle
         elif self.by == "pose":
-            offset, error, _ = self.lane.place(memory.turned, seen.estimate)
+            pose = seen.estimate
+            _, offset, error = self.legs.seen(memory.turned, pose.x, pose.y, pose.heading)
         else:
             error = memory.error + seen.estimate.heading - memory.heading
             offset = self._heard(memory.offset, error, seen, dt)
@@ -193,7 +168,7 @@ def straighten(
         hold=holding_throttle(car, speed) / max(speed, 0.1),
         dead_zone=car.motor.dead_zone,
         limit=min(float(car.servo.limit_left), float(car.servo.limit_right)),
-        lane=lane(course, laps),
+        legs=legs_of(course, laps),
         by=by,
     )
 

@@ -8,10 +8,9 @@ which the driver hands over; before and after, the closed loop drives.
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from countersteer.batch.engine import LANES
@@ -19,70 +18,21 @@ from countersteer.batch.evaluate import interval
 from countersteer.batch.population import draw, load_population
 from countersteer.batch.trials import run_trials
 from countersteer.car.car import Car
-from countersteer.car.parameter import changed, pytree
+from countersteer.car.parameter import changed
 from countersteer.course.course import Course, from_segments
-from countersteer.drivers.drift_turn import STRAIGHT, DriftTurn, drift_turn
-from countersteer.drivers.driver import Observation, Status
+from countersteer.drivers.drift_turn import DriftTurn, drift_turn
+from countersteer.drivers.played_turn import STEP, PlayedTurn
 from countersteer.experiments.found import Found, Report, silent
 from countersteer.link.link import LINKS
 from countersteer.pilot import Pilot
-from countersteer.signals import Command, Scalar
 from countersteer.simulator import Simulator
 from countersteer.task.task import Outcome
 
 TRIALS = 256
 SPEED = 2.0  # m/s
-STEP = 0.01  # s between the recorded commands
 AFTER = 0.2  # s for which they go on once the car goes straight
 LONGEST = 8.0  # s of a trial
 BATTERIES = {"first": (1.0, 0.0), "last": (0.3, 1.0)}  # charge, wear
-
-
-class OpenLoopMemory(NamedTuple):
-    """Of the driver within, and when the turn began (s)."""
-
-    inner: Any
-    turn: Scalar
-    begun: Scalar
-
-
-@pytree
-class OpenLoop:
-    """A turn's commands played back from where the driver within hands over to it."""
-
-    inner: DriftTurn
-    throttle: np.ndarray  # each `STEP` seconds from the turn's beginning
-    steering: np.ndarray  # rad
-
-    def reset(self, key: jax.Array) -> OpenLoopMemory:
-        """Before the turn."""
-        return OpenLoopMemory(self.inner.reset(key), 0, math.inf)
-
-    def status(self, memory: OpenLoopMemory) -> Status:
-        """That of the driver within."""
-        return self.inner.status(memory.inner)
-
-    def act(
-        self, memory: OpenLoopMemory, observation: Observation
-    ) -> tuple[Command, OpenLoopMemory]:
-        """The recorded command in the turn, else the inner driver's."""
-        now = observation.time
-        command, inner = self.inner.act(memory.inner, observation)
-        turn = self.inner.status(inner).turn
-        begun = jnp.where(turn > memory.turn, now, memory.begun)
-        index = jnp.floor((now - begun) / STEP + 1e-3)
-        count = self.throttle.shape[-1]
-        playing = (index >= 0) & (index < count)
-        at = jnp.clip(jnp.where(playing, index, 0), 0, count - 1).astype(jnp.int32)
-        throttle, steering = jnp.asarray(self.throttle)[at], jnp.asarray(self.steering)[at]
-        # What the driver within made of the turn is not asked: behind it, it straightens.
-        over = (index >= count) & (now - begun < (count + 2) * STEP)
-        inner = inner._replace(phase=jnp.where(over, STRAIGHT, inner.phase))
-        command = Command(
-            jnp.where(playing, throttle, command.throttle),
-            jnp.where(playing, steering, command.steering),
-        )
-        return command, OpenLoopMemory(inner, turn, begun)
 
 
 def corner(width: float = 1.4, name: str = "corner") -> Course:
@@ -113,7 +63,7 @@ def simulate(
     """Eight cells of trials: rate, loop, battery."""
     course = corner()
     closed = drift_turn(course, car, SPEED)
-    open_loop = OpenLoop(
+    open_loop = PlayedTurn(
         inner=closed,
         **dict(zip(("throttle", "steering"), record(course, car, closed), strict=True)),
     )

@@ -14,8 +14,6 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
@@ -23,15 +21,12 @@ from countersteer.batch.engine import LANES
 from countersteer.batch.evaluate import DRIFT
 from countersteer.batch.open_drives import drives, repeated
 from countersteer.car.car import Car
-from countersteer.car.parameter import pytree
 from countersteer.course.course import from_segments
-from countersteer.drivers.driver import Observation
+from countersteer.drivers.corner import Corner
 from countersteer.drivers.policy import library
-from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.drivers.turning import Turning
 from countersteer.experiments.found import Found, Report, silent
-from countersteer.signals import Command, Scalar
 
 DRAWS = 512
 GATE = 1.2  # m before and behind the corner
@@ -44,71 +39,6 @@ MARGIN = 0.03  # m from the outer wall at the start
 # turning-in from the corner (m), and how far the wheels go or the law's numbers are scaled.
 GRIP = ((0.6, 2.6), (0.0, 1.0), (-0.4, 1.0), (0.3, 1.0), (0.0, 1.0))
 SLIDE = ((1.2, 3.0), (0.0, 1.0), (-0.4, 1.15), (0.7, 1.6), (0.0, 1.0))
-
-AHEAD, TURN, STOP, SETTLE = 0, 1, 2, 3
-
-
-class CornerMemory(NamedTuple):
-    """What the driver is about."""
-
-    phase: Scalar
-    entry: Scalar  # m/s
-
-
-@pytree
-class Corner:
-    """A left turn of 90° begun at x; told the truth. `slides`: by the laws of drift-turn."""
-
-    turning: Turning
-    stop_angle: StopAngle
-    slides: Scalar  # 1 by drift, 0 by grip
-    speed: Scalar
-    begin: Scalar  # x at which the wheels turn over, m
-    lock: Scalar  # by grip, rad
-    hold: Scalar  # throttle that holds the speed
-    power: Scalar  # by drift: factor on the throttle of the spin
-    limit: Scalar
-    front_axle: Scalar
-
-    def reset(self, key: jax.Array) -> CornerMemory:
-        """Straight ahead."""
-        del key
-        return CornerMemory(AHEAD, 0.0)
-
-    def act(self, memory: CornerMemory, observation: Observation) -> tuple[Command, CornerMemory]:
-        """One control period."""
-        seen, own = observation.estimate, self.turning
-        speed = jnp.maximum(seen.vx, 0.5)
-        left_over = math.pi / 2 - seen.heading
-        begins = (memory.phase == AHEAD) & (seen.x >= self.begin)
-        entry = jnp.where(begins, speed, memory.entry)
-        missing = left_over - self.stop_angle.angle(speed, jnp.maximum(seen.yaw_rate, 0.0))
-        stops = (memory.phase == TURN) & (missing <= 0)
-        settles = (memory.phase == STOP) & (seen.yaw_rate < own.settled)
-        phase = memory.phase
-        for happens, into in ((begins, TURN), (stops, STOP), (settles, SETTLE)):
-            phase = jnp.where(happens, into, phase)
-        held = jnp.clip(self.hold + 0.25 * (self.speed - seen.vx), 0.0, 1.0)
-        spin, stop = own.spin(entry, seen.yaw_rate), own.stop(entry, missing)
-        slip = jnp.arctan2(seen.vy + self.front_axle * seen.yaw_rate, speed)
-        settle = own.hold_p * left_over - own.hold_d * seen.yaw_rate + own.hold_slip * slip
-        straight = -0.9 * seen.heading - 0.1 * seen.yaw_rate
-        steering, throttle = straight, held
-        for which, lock, power in (
-            (TURN, spin.steering, self.power * spin.throttle),
-            (STOP, stop.steering, stop.throttle),
-            (SETTLE, settle, held),
-        ):
-            steering = jnp.where(phase == which, lock, steering)
-            throttle = jnp.where(phase == which, power, throttle)
-        # By grip the lock is given back in time for the car to come out straight.
-        arc = jnp.clip(2.0 * left_over - 0.25 * seen.yaw_rate, -self.lock, self.lock)
-        slides, ahead = self.slides > 0, phase == AHEAD
-        steering = jnp.where(slides | ahead, steering, arc)
-        throttle = jnp.where(slides, throttle, held)
-        return Command(
-            jnp.clip(throttle, 0.0, 1.0), jnp.clip(steering, -self.limit, self.limit)
-        ), CornerMemory(phase, entry)
 
 
 class Tried(NamedTuple):

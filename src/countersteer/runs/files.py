@@ -3,7 +3,7 @@
 import csv
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -154,3 +154,9 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     writer = TableWriter(path, list(columns))
     writer.write(column_rows(columns.values()))
     writer.close()
+
+
+def require(place: Callable[[int], str], good: np.ndarray, message: str) -> None:
+    """Raise `InputError` at the first row that is not good; `place` says where that row is."""
+    if not np.all(good):
+        raise InputError(f"{place(int(np.argmin(good)))}: {message}")

@@ -18,7 +18,6 @@ nothing changes (`persistence`), and all of it for those windows in which someth
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -27,7 +26,6 @@ from scipy.optimize import minimize_scalar
 
 from countersteer.car.car import Car
 from countersteer.errors import InputError
-from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 from countersteer.tuning import fit
 from countersteer.tuning.windows import (
@@ -38,7 +36,6 @@ from countersteer.tuning.windows import (
     Measured,
     Reference,
     find_references,
-    pieces,
     read_measured,
     simulate,
     speed_at,
@@ -47,8 +44,7 @@ from countersteer.tuning.windows import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    pass
 
 HORIZON = 1.0  # s, unless told
 SAMPLE = 0.01  # s between the instants at which states are compared
@@ -242,7 +238,7 @@ def compared(
     for name, reference in references.items():
         signal = reference.signal
         at = samples
-        if reference.sensor:
+        if reference.timing is not None:
             at = signal.time[(signal.time > start + EARLY) & (signal.time <= time[-1] + EARLY)]
         truth = signal.at(at)
         known = np.isfinite(truth)
@@ -256,7 +252,7 @@ def compared(
                 sensed(reference, time, series, at, resting) for series in (values, still)
             )
             window[name] = Compared(at, truth, simulated, unchanged)
-    states = [name for name, reference in references.items() if not reference.sensor]
+    states = [name for name, reference in references.items() if reference.timing is None]
     if not window or any(name not in window for name in states):
         return None
     return window
@@ -269,20 +265,21 @@ def sensed(
 
     Readings early in a window reach back before its start: there, the measured quantity is taken.
     """
-    if not reference.sensor:
+    if reference.timing is None:
         return np.interp(at, time, values)
-    before = time[0] + np.arange(-(reference.lag + reference.over), -1e-9, SAMPLE)
+    lag, over, step = reference.timing
+    before = time[0] + np.arange(-(lag + over), -1e-9, SAMPLE)
     past = reference.undone(before, resting)
     past = np.where(np.isfinite(past), past, values[0])
     time, values = np.concatenate([before, time]), np.concatenate([past, values])
-    middle = at - reference.lag
-    if reference.over:
+    middle = at - lag
+    if over:
         area = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
-        ends = [np.interp(middle + side * reference.over / 2, time, area) for side in (-1, 1)]
-        read = (ends[1] - ends[0]) / reference.over
+        ends = [np.interp(middle + side * over / 2, time, area) for side in (-1, 1)]
+        read = (ends[1] - ends[0]) / over
     else:
         read = np.interp(middle, time, values)
-    return np.rint(read / reference.quantum) * reference.quantum if reference.quantum else read
+    return np.rint(read / step) * step if step else read
 
 
 def changes(window: Window) -> bool:
@@ -324,176 +321,3 @@ def scores(windows: Iterable[Window]) -> dict[str, Any]:
             scored["median_abs_error"][name] = float(np.median(ends))
             scored["rmse"][name] = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     return {**result, "persistence": still}
-
-
-# -------------------------------------------------------------------------------------------------
-# The picture
-# -------------------------------------------------------------------------------------------------
-
-_SIZE_IN, _DPI = (14.0, 9.0), 100
-_PAPER, _INK, _SOFT, _LINE, _RELEASED = "#fffefb", "#1b2229", "#5a6570", "#e2ded3", "#f1efe8"
-_MEASURED, _SIMULATED, _STEERED = "#8796a3", "#c4400f", "#0069a8"
-_NAMES = {
-    "vx_mps": ("Forward velocity", "m/s"),
-    "vy_mps": ("Lateral velocity, left positive", "m/s"),
-    "yaw_rate_radps": ("Yaw rate, left positive", "rad/s"),
-    "wheel_speed_mps": ("Wheel speed", "m/s"),
-}
-_SHOWN_EVERY = 1.0  # s between the windows that are drawn
-_LEFT, _RIGHT, _TOP, _BOTTOM, _CAPTION = 0.055, 0.955, 0.895, 0.065, 0.033  # parts of the figure
-
-
-def draw_comparison(series: Mapping[str, Any], path: Path) -> None:
-    """Write to `path`, as PNG, what `compare` gave as its series: measured against simulated.
-
-    Windows are drawn every second at the most, each from its start, marked by a dot. An existing
-    file is replaced.
-    """
-    # Matplotlib takes longer to import than the drawing: who draws nothing does not wait for it.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor=_PAPER)
-    canvas = FigureCanvasAgg(figure)
-    result = series["result"]
-    shown = _apart(series["starts_s"], max(_SHOWN_EVERY, result["horizon_s"]))
-    _write_headline(figure, series["title"], result, len(shown))
-    names = [name for name in QUANTITIES if name in series["measured"]]
-    pitch = (_TOP - _BOTTOM) / (len(names) + 1)
-    for k, name in enumerate([*names, "commands"]):
-        bottom = _TOP - (k + 1) * pitch
-        axes = figure.add_axes((_LEFT, bottom, _RIGHT - _LEFT, pitch - _CAPTION - 0.008))
-        _dress(axes, series, is_last=name == "commands")
-        if name == "commands":
-            _draw_commands(axes, series["commands"])
-            _write_caption(figure, bottom + pitch, "Commands", "")
-            continue
-        _draw_quantity(axes, series, name, shown)
-        title, unit = _NAMES[name]
-        _write_caption(figure, bottom + pitch, f"{title}, {unit}", _said(result, name, unit))
-    canvas.print_png(str(path))
-
-
-def _apart(starts: list[float], least: float) -> list[int]:
-    """Choose windows so that each starts at least so long after the one before."""
-    chosen: list[int] = []
-    for i, start in enumerate(starts):
-        if not chosen or start >= starts[chosen[-1]] + least - EARLY:
-            chosen.append(i)
-    return chosen
-
-
-def _said(result: Mapping[str, Any], name: str, unit: str) -> str:
-    """Say both errors of a quantity, beside those of doing nothing."""
-    if name not in result["rmse"]:
-        return ""
-    still, errors = result["persistence"], []
-    for words, key in (("median at the end", "median_abs_error"), ("RMS", "rmse")):
-        errors.append(f"{words} {result[key][name]:.2f}  ({still[key][name]:.2f})")
-    return f"error, {unit}:   " + "     ".join(errors)
-
-
-def _write_headline(figure: "Figure", title: str, result: Mapping[str, Any], shown: int) -> None:
-    """Write across the top what is compared, and the key."""
-    from matplotlib.lines import Line2D
-
-    figure.text(_LEFT, 0.962, title, color=_INK, size=15, weight="bold", va="center")
-    count, seconds = result["windows"], f"{result['horizon_s']:.3g} s"
-    windows = f"One window of {seconds}."
-    if count > 1:
-        drawn = "" if shown == count else f", {shown} of them drawn"
-        lively = result["transient"]["windows"]
-        windows = f"{count} windows of {seconds}{drawn}; something changes in {lively}."
-    figure.text(
-        _LEFT,
-        0.927,
-        f"{windows}   In brackets: the errors of predicting that nothing changes.",
-        color=_SOFT,
-        size=10.5,
-        va="center",
-    )
-    for right, words, colour in (
-        (0.845, "measured", _MEASURED),
-        (_RIGHT, "simulated", _SIMULATED),
-    ):
-        figure.text(right, 0.927, words, color=colour, size=11, va="center", ha="right")
-        figure.add_artist(
-            Line2D(
-                [right - 0.085, right - 0.063],
-                [0.927] * 2,
-                color=colour,
-                linewidth=2.4,
-                marker="o" if colour == _SIMULATED else None,
-                markersize=5,
-                markevery=[0],
-            )
-        )
-
-
-def _write_caption(figure: "Figure", top: float, left: str, right: str) -> None:
-    """Write above a strip what it shows, and how well."""
-    y = top - _CAPTION / 2 - 0.004
-    figure.text(_LEFT, y, left, color=_INK, size=10.5, weight="bold", va="center")
-    figure.text(_RIGHT, y, right, color=_SOFT, size=10, va="center", ha="right")
-
-
-def _dress(axes: "Axes", series: Mapping[str, Any], is_last: bool) -> None:
-    """Prepare a strip: the log's time across, grey where the dead-man switch is released."""
-    time = series["commands"]["time_s"]
-    end = max(float(time[-1]), float(time[0]) + 1e-3)
-    axes.set_xlim(float(time[0]), end)
-    armed = series["armed"]
-    if armed is not None:
-        until = np.append(armed.time[1:], end)
-        for begin, finish in pieces(armed.value < 0.5):
-            span = (armed.time[begin], until[finish - 1])
-            axes.axvspan(*span, color=_RELEASED, linewidth=0, zorder=0)
-    axes.grid(color=_LINE, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.set_frame_on(False)
-    axes.tick_params(length=0, labelsize=9.5, labelcolor=_SOFT, pad=5, labelbottom=is_last)
-    axes.locator_params(axis="y", nbins=5)
-    if is_last:
-        axes.set_xlabel("time, s  (grey: dead-man switch released)", color=_SOFT, size=9.5)
-
-
-def _draw_quantity(
-    axes: "Axes", series: Mapping[str, Any], name: str, shown: Iterable[int]
-) -> None:
-    """Draw a quantity as measured, and as simulated from the starts of the windows shown."""
-    signal = series["measured"][name]
-    axes.plot(signal.time, signal.value, color=_MEASURED, linewidth=2.2, zorder=2)
-    within = (signal.time >= axes.get_xlim()[0]) & (signal.time <= axes.get_xlim()[1])
-    seen = [signal.value[within]]
-    for i in shown:
-        window: Window = series["windows"][i]
-        if name not in window:
-            continue
-        time, simulated = window[name].time, window[name].simulated
-        start = series["starts_s"][i]
-        time = np.concatenate([[start], time])
-        simulated = np.concatenate([window[name].unchanged[:1], simulated])
-        axes.plot(time, simulated, color=_SIMULATED, linewidth=1.5, zorder=3)
-        axes.plot(time[:1], simulated[:1], "o", color=_SIMULATED, markersize=3.2, zorder=3)
-        seen.append(simulated)
-    low, high = np.nanmin(np.concatenate(seen)), np.nanmax(np.concatenate(seen))
-    span = max(float(high - low), 0.1)
-    axes.set_ylim(low - 0.06 * span, high + 0.06 * span)
-
-
-def _draw_commands(axes: "Axes", commands: Table) -> None:
-    """Draw throttle on the left scale and steering on the right one."""
-    time, throttle = commands["time_s"], 100 * commands["throttle"]
-    axes.step(time, throttle, where="post", color=_INK, linewidth=1.3)
-    top = max(100.0, float(np.max(np.abs(throttle))))
-    axes.set_ylim(-1.06 * top if np.min(throttle) < 0 else -0.06 * top, 1.06 * top)
-    axes.set_ylabel("throttle, %", color=_INK, size=9.5)
-    right = axes.twinx()
-    degrees = np.degrees(commands["steering"])
-    right.step(time, degrees, where="post", color=_STEERED, linewidth=1.3)
-    most = max(10.0, float(np.max(np.abs(degrees))))
-    right.set_ylim(-1.08 * most, 1.08 * most)
-    right.set_ylabel("steering asked for, °", color=_STEERED, size=9.5)
-    right.set_frame_on(False)
-    right.tick_params(length=0, labelsize=9.5, labelcolor=_STEERED, pad=5)
-    right.locator_params(axis="y", nbins=5)

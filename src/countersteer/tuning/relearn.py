@@ -63,7 +63,7 @@ def kinds(shots: Shots) -> np.ndarray:
     return kind
 
 
-def pieces(run_of: np.ndarray, start: np.ndarray) -> np.ndarray:
+def pieces_of_time(run_of: np.ndarray, start: np.ndarray) -> np.ndarray:
     """The piece, 0 to `PIECES` - 1, of each window: as many windows each, in order of time."""
     rank = np.argsort(np.lexsort((start, run_of)))
     return rank * PIECES // len(rank)
@@ -114,7 +114,7 @@ def judge(
         ]
     )
     beyond = float(np.mean(on_new - usual[kind_new]))
-    piece = pieces(old.run, old.start)
+    piece = pieces_of_time(old.run, old.start)
     means = [np.mean((on_old - usual[kind_old])[piece == k]) for k in range(PIECES)]
     spread = float(np.std(means, ddof=1))
     as_many = len(new.start) * PIECES / len(old.start)

@@ -82,7 +82,7 @@ def take(
             seen.append(np.full(after.shape, np.nan))
             continue
         reference = references[name]
-        seen.append(reference.undone(after) if reference.sensor else reference.signal.at(after))
+        seen.append(reference.undone(after) if reference.timing else reference.signal.at(after))
     wheels = references.get("wheel_speed_mps")
     nothing = np.full(len(starts), np.nan)
     mean = nothing if wheels is None else wheels.undone(time, resting)

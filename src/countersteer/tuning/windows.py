@@ -6,7 +6,6 @@ car's encoder and gyroscope, with lag and quantum.
 """
 
 import math
-from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,6 +15,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from countersteer.car.car import Car
+from countersteer.runs.defects import stretches
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 from countersteer.signals import Command, Motion, Scalar, Wheels
@@ -30,16 +30,6 @@ SLOWEST = 0.2  # m/s from which a window starts
 
 SMOOTHED_OVER, DEGREE = 0.15, 3  # s and degree of the Savitzky-Golay filter
 GAP = 0.035  # s without motion capture over which nothing is interpolated
-
-# Lags of the DART car's sensors, from the instant to the row in which its reading first appears,
-# measured against motion capture on the four recordings that have it. The gyroscope's is sharp
-# (rms 0.07 rad/s at 0.05 s, 0.16 to 0.41 at 0.09 s); the encoder's is that of straight driving in
-# grip (rms 0.024 m/s at 0.055 s, 0.08 at 0.13 s), about half of the 0.1 s over which it counts. The
-# 0.09 s and 0.11 to 0.15 s that have been reported for these logs are those of the columns as they
-# stand in the file, which hold each reading for 0.1 s and so are 0.05 s later on average.
-ENCODER_LAG, ENCODER_COUNTS = 0.06, 0.1  # s: lag of its middle, and time over which it counts
-ENCODER_QUANTUM = 0.0413  # m/s
-GYRO_LAG = 0.05  # s
 
 PIECE = 100  # ticks in a call of the compiled program, whatever the horizon
 SIZES = (1, 32, 256)  # windows simulated at once: few, for each is a program of its own
@@ -60,6 +50,14 @@ class Signal(NamedTuple):
         return np.interp(time, self.time, self.value, left=math.nan, right=math.nan)
 
 
+class Timing(NamedTuple):
+    """How late a reading is (s), the time that it is a mean over (s), and its step."""
+
+    lag: float = 0.0
+    over: float = 0.0
+    step: float = 0.0
+
+
 class Measured(NamedTuple):
     """What a log says about the car's motion, in SI units; None where it says nothing."""
 
@@ -68,22 +66,17 @@ class Measured(NamedTuple):
     yaw_rate: Signal | None
     wheels: tuple[Signal, ...] | None  # rim speed of the four, known for simulated cars alone
     encoder: Signal | None  # as reported
+    encoder_timing: Timing
     gyro: Signal | None
+    gyro_timing: Timing
     armed: Signal | None  # dead-man switch, held between its reports; None: always closed
 
 
 class Reference(NamedTuple):
-    """A quantity that simulated ones are compared with.
-
-    A reading of a sensor shows what was `lag` seconds before, on average over a time of `over`, in
-    steps of `quantum`. A state has none of it.
-    """
+    """A quantity that simulated ones are compared with: a state, or readings of a sensor."""
 
     signal: Signal
-    sensor: bool
-    lag: float = 0.0
-    over: float = 0.0
-    quantum: float = 0.0
+    timing: Timing | None = None  # None: a state
 
     def undone(self, time: np.ndarray, resting: np.ndarray | bool = False) -> np.ndarray:
         """Take the lag off: the quantity itself at these times, as far as the sensor tells.
@@ -92,8 +85,9 @@ class Reference(NamedTuple):
         which shows what followed. Before the first reading it is that reading; NaN after the last.
         """
         times, values = self.signal
+        lag = 0.0 if self.timing is None else self.timing.lag
         last = values[np.maximum(np.searchsorted(times, time + EARLY, side="right") - 1, 0)]
-        late = np.interp(time + self.lag, times, values, right=math.nan)
+        late = np.interp(time + lag, times, values, right=math.nan)
         return np.where(resting, last, late)
 
 
@@ -128,9 +122,33 @@ def read_measured(run: Run, car: Car) -> Measured:
         yaw_rate,
         wheels,
         _reported(telemetry, "wheel_speed_mps"),
+        encoder_timing(run, car),
         _reported(telemetry, "gyro_radps"),
+        gyro_timing(run),
         _reported(telemetry, "armed"),
     )
+
+
+def encoder_timing(run: Run, car: Car) -> Timing:
+    """The encoder's, as the run has it in `[sensors.encoder]`, else as the car declares it.
+
+    The car's encoder counts regions over its update time; so a reading is that of half of it ago.
+    """
+    part = car.sensors.encoder
+    over = float(part.update)
+    tire = car.tires.rear if "rear" in part.on else car.tires.front
+    declared = {
+        "lag_s": over / 2,
+        "over_s": over,
+        "step_mps": math.pi * float(tire.radius) / float(part.regions) / over,
+    }
+    known = declared | run.about.get("sensors", {}).get("encoder", {})
+    return Timing(known["lag_s"], known["over_s"], known["step_mps"])
+
+
+def gyro_timing(run: Run) -> Timing:
+    """The gyroscope's, as the run has it in `[sensors.gyroscope]`, else without a lag."""
+    return Timing(run.about.get("sensors", {}).get("gyroscope", {}).get("lag_s", 0.0))
 
 
 def _reported(table: Table, name: str) -> Signal | None:
@@ -166,7 +184,8 @@ def velocities(
     known = time[after] - time[after - 1] <= max(GAP, 1.5 * step)
     width = max(DEGREE + 2, 2 * round(SMOOTHED_OVER / step / 2) + 1)
     out = np.full((3, len(grid)), math.nan)
-    for begin, end in pieces(known):
+    for first, last in stretches(known):
+        begin, end = first, last + 1
         if end - begin < width:
             continue
         pose = np.stack([np.interp(grid[begin:end], time, v) for v in (x, y, heading)])
@@ -179,28 +198,20 @@ def velocities(
     return Signal(grid, out[0]), Signal(grid, out[1]), Signal(grid, out[2])
 
 
-def pieces(known: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Begin and end of each run of True."""
-    edges = np.nonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))[0]
-    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-
-
 def find_references(measured: Measured) -> dict[str, Reference]:
     """Find what the log holds of each quantity."""
     found: dict[str, Reference] = {}
     if measured.vx is not None and measured.vy is not None and measured.yaw_rate is not None:
-        found["vx_mps"] = Reference(measured.vx, sensor=False)
-        found["vy_mps"] = Reference(measured.vy, sensor=False)
-        found["yaw_rate_radps"] = Reference(measured.yaw_rate, sensor=False)
+        found["vx_mps"] = Reference(measured.vx)
+        found["vy_mps"] = Reference(measured.vy)
+        found["yaw_rate_radps"] = Reference(measured.yaw_rate)
     elif measured.gyro is not None:
-        found["yaw_rate_radps"] = Reference(measured.gyro, sensor=True, lag=GYRO_LAG)
+        found["yaw_rate_radps"] = Reference(measured.gyro, measured.gyro_timing)
     if measured.wheels is not None:
         mean = np.mean([wheel.value for wheel in measured.wheels], axis=0)
-        found["wheel_speed_mps"] = Reference(Signal(measured.wheels[0].time, mean), sensor=False)
+        found["wheel_speed_mps"] = Reference(Signal(measured.wheels[0].time, mean))
     elif measured.encoder is not None:
-        found["wheel_speed_mps"] = Reference(
-            measured.encoder, True, ENCODER_LAG, ENCODER_COUNTS, ENCODER_QUANTUM
-        )
+        found["wheel_speed_mps"] = Reference(measured.encoder, measured.encoder_timing)
     return found
 
 

@@ -15,6 +15,7 @@ from countersteer.car.car import wheel_positions
 from countersteer.errors import InputError
 from countersteer.runs.run import Run, drawn_car
 from countersteer.viewing import picture
+from countersteer.viewing.style import INK, LINE, PAPER, SOFT
 
 Array = NDArray[np.float64]
 
@@ -105,9 +106,9 @@ class Animation:
             strips.append(Strip("Sideslip", "{:.0f}°", self._time, shown, "#c97a10"))
         if "yaw_rate_radps" in truth:
             turning = np.degrees(truth["yaw_rate_radps"])
-            strips.append(Strip("Yaw rate", "{:.0f}°/s", self._time, turning, picture.SOFT))
+            strips.append(Strip("Yaw rate", "{:.0f}°/s", self._time, turning, SOFT))
         throttle = 100 * asked["throttle"]
-        strips.append(Strip("Throttle", "{:.0f} %", asked["time_s"], throttle, picture.SOFT))
+        strips.append(Strip("Throttle", "{:.0f} %", asked["time_s"], throttle, SOFT))
         self._strips = strips
         self._trail = self._make_trail(truth, slip)
         self._place()
@@ -131,7 +132,7 @@ class Animation:
             done = max(done, now)
             floor = still.copy()
             self._draw_car(floor, pose, float(np.interp(moment, self._time, self._steering)))
-            frame = Image.new("RGB", self.size, picture.PAPER)
+            frame = Image.new("RGB", self.size, PAPER)
             frame.paste(floor.reduce(FINE), (0, 0))
             self._draw_panel(frame, plain, drawn, moment)
             yield frame
@@ -150,7 +151,7 @@ class Animation:
         pose = np.column_stack([at(column) for column in self._pose.T])
         hubs = np.array(wheel_positions(self._car.body), float).T
         wheels = picture.placed(hubs, pose).swapaxes(0, 1)
-        colours, marks = [picture.SOFT] * len(time), np.zeros((4, len(time)))
+        colours, marks = [SOFT] * len(time), np.zeros((4, len(time)))
         if slip is not None:
             end = max(math.radians(20), float(np.nanmax(np.abs(slip))))
             colours = [ramp(part) for part in (np.abs(at(slip)) / end).tolist()]
@@ -218,7 +219,7 @@ class Animation:
         centre = pose[:2] if self.options.follow else self._middle
         low, high = centre - reach, centre + reach
         step = picture.nice_step(float(max(high - low)) / 10)
-        grid = mixed(picture.FLOOR, picture.LINE, 0.55)
+        grid = mixed(picture.FLOOR, LINE, 0.55)
         for axis in (0, 1):
             for k in range(math.ceil(low[axis] / step), math.floor(high[axis] / step) + 1):
                 ends = np.array([low, high])
@@ -242,7 +243,7 @@ class Animation:
             for k in range(begin, end):
                 if marks[k] > 0:
                     dark = picture.SKID_DARKEST * (0.25 + 0.75 * float(marks[k]))
-                    colour = mixed(picture.FLOOR, picture.INK, dark)
+                    colour = mixed(picture.FLOOR, INK, dark)
                     self._stroke(draw, track[k - 1 : k + 1], colour, tire)
         # The rear tyres come over what was drawn of the path before.
         width = max(1.5, 0.03 * self._scale)
@@ -264,7 +265,7 @@ class Animation:
 
         half = np.array([float(body.length), float(body.width)]) / 2
         centre = np.array([float(body.center), 0.0])
-        fill(picture.BODY * (half + 0.7 / self._scale) + centre, picture.PAPER)
+        fill(picture.BODY * (half + 0.7 / self._scale) + centre, PAPER)
         fill(picture.BODY * half + centre, PAINT)
         for window in (picture.WINDSCREEN, picture.REAR_WINDOW):
             fill(window * half + centre, picture.GLASS)
@@ -273,7 +274,7 @@ class Animation:
         for k, (x, y, tire) in enumerate(zip(*wheel_positions(body), sizes, strict=True)):
             hub = np.array([[float(x), float(y), steering if k < 2 else 0.0]])
             size = (float(tire.radius), float(tire.width) / 2)
-            fill(picture.placed(tread * size, hub)[0], picture.INK)
+            fill(picture.placed(tread * size, hub)[0], INK)
 
     # ---------------------------------------------------------------------------------------------
     # The panel
@@ -283,7 +284,7 @@ class Animation:
         """The strips with their curves faint, and with their curves in full."""
         made = []
         for strength in (0.22, 1.0):
-            image = Image.new("RGB", (FINE * self.size[0], FINE * self.size[1]), picture.PAPER)
+            image = Image.new("RGB", (FINE * self.size[0], FINE * self.size[1]), PAPER)
             draw = ImageDraw.Draw(image)
             for strip, box in zip(self._strips, self._boxes(), strict=True):
                 left, top, right, bottom = (FINE * n for n in box)
@@ -295,11 +296,11 @@ class Animation:
                 x = left + (time - ends[0]) / (ends[1] - ends[0]) * (right - left)
                 y = bottom - (values - low) / span * (bottom - top)
                 zero = bottom + low / span * (bottom - top)
-                colour = mixed(picture.PAPER, strip.colour, strength)
-                fill = mixed(picture.PAPER, strip.colour, 0.16 * strength)
+                colour = mixed(PAPER, strip.colour, strength)
+                fill = mixed(PAPER, strip.colour, 0.16 * strength)
                 curve = list(zip(x.tolist(), y.tolist(), strict=True))
                 draw.polygon([(left, zero), *curve, (right, zero)], fill=fill)
-                draw.line([(left, zero), (right, zero)], fill=picture.LINE, width=FINE)
+                draw.line([(left, zero), (right, zero)], fill=LINE, width=FINE)
                 draw.line(curve, fill=colour, width=round(1.6 * self._unit * FINE))
             made.append(image.reduce(FINE))
         return made[0], made[1]
@@ -313,7 +314,7 @@ class Animation:
         share = (moment - self.moments[0]) / span
         boxes, gap = self._boxes(), round(4 * self._unit)
         head = boxes[0][1] - round((HEAD + 8) * self._unit)
-        draw.text((boxes[0][0], head), f"{moment:.2f} s", picture.INK, self._font[20], anchor="la")
+        draw.text((boxes[0][0], head), f"{moment:.2f} s", INK, self._font[20], anchor="la")
         for strip, (left, top, right, bottom) in zip(self._strips, boxes, strict=True):
             now = round(left + share * (right - left))
             region = (left, top - gap, right, bottom + gap)
@@ -321,11 +322,11 @@ class Animation:
             region = (left, top - gap, now, bottom + gap)
             if now > left:
                 frame.paste(drawn.crop(region), region[:2])
-            draw.line([(now, top - gap), (now, bottom + gap)], fill=picture.INK)
+            draw.line([(now, top - gap), (now, bottom + gap)], fill=INK)
             value = float(np.interp(moment, strip.time, np.nan_to_num(strip.values)))
             shown = strip.form.format(value if abs(value) >= 0.5 else abs(value))
-            draw.text((left, top - gap), strip.name, picture.SOFT, self._font[12], anchor="ld")
-            draw.text((right, top - gap), shown, picture.INK, self._font[12], anchor="rd")
+            draw.text((left, top - gap), strip.name, SOFT, self._font[12], anchor="ld")
+            draw.text((right, top - gap), shown, INK, self._font[12], anchor="rd")
 
 
 def held(time: Array, given: Array, values: Array) -> Array:

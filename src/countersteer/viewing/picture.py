@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from countersteer.viewing.style import DPI, INK, LINE, PAPER, SOFT, new_figure
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
@@ -20,8 +22,7 @@ Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]  # left, bottom, width, height; parts of the figure
 
 _SIZE_IN = (14.0, 9.0)
-_DPI = 100
-PAPER, FLOOR, INK, SOFT, LINE = "#fffefb", "#fbfaf6", "#1b2229", "#5a6570", "#e2ded3"
+FLOOR = "#fbfaf6"
 WALL, GLASS, _TURN, SPEED = "#39434c", "#303a43", "#f3eee1", "#0069a8"
 _GOOD, _BAD = "#00694f", "#a3210f"
 # From calm to wild. The lightness falls all the way, so the order needs no red and green.
@@ -69,13 +70,9 @@ def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
     The car stands on its path at regular intervals, denser in turns, coloured by its sideslip.
     An existing file is replaced.
     """
-    # Matplotlib takes longer to import than the drawing: who draws nothing does not wait for it.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor=PAPER)
-    canvas = FigureCanvasAgg(figure)
+    figure, canvas = new_figure(*_SIZE_IN)
     low, high = _bounds(view)
     layout = _BELOW if high[0] - low[0] > _LONG * (high[1] - low[1]) else _BESIDE
     colours = LinearSegmentedColormap.from_list("sideslip", SLIP_COLOURS)
@@ -104,9 +101,9 @@ def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: fl
     summary = view["summary"]
     status = str(summary["outcome"])
     figure.text(0.022, 0.955, str(view["title"]), color=INK, size=18, weight="bold", va="center")
-    said = status[:1].upper() + status[1:]
+    verdict = status[:1].upper() + status[1:]
     mood = _GOOD if summary["completed"] else _BAD
-    figure.text(0.022, 0.914, said, color=mood, size=13, weight="bold", va="center")
+    figure.text(0.022, 0.914, verdict, color=mood, size=13, weight="bold", va="center")
     lap_time, times = summary.get("lap_time_s"), view["time_s"]
     facts = (
         ("drive time", f"{times[-1] - times[0]:.2f} s")
@@ -320,7 +317,7 @@ def _draw_keys(
 
 def _paint_ramp(figure: "Figure", colours: "Colormap", place: Rectangle) -> None:
     """Paint all of `colours`, from left to right, into `place`."""
-    across, up = (int(inches * _DPI) for inches in _SIZE_IN)
+    across, up = (int(inches * DPI) for inches in _SIZE_IN)
     left, bottom, width, height = place
     shades = colours(np.linspace(0, 1, int(width * across)))
     pixels = np.broadcast_to(shades, (int(height * up), *shades.shape))

@@ -4,7 +4,7 @@ import base64
 import io
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import reduce
 from html import escape
 from pathlib import Path
@@ -16,9 +16,19 @@ from numpy.typing import NDArray
 from countersteer.car.car import Car
 from countersteer.car.parameter import Declaration, declarations
 from countersteer.viewing.page import filled
+from countersteer.viewing.style import (
+    INK,
+    SIMULATED,
+    SOFT,
+    Prediction,
+    draw_commands,
+    draw_windows,
+    dress,
+    new_figure,
+)
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 Numbers = NDArray[np.float64]
 
@@ -41,8 +51,7 @@ MEASURES = {
 MANY = 6  # lines from which a list is folded away
 CORRELATED = 0.8
 
-_INK, _SOFT, _LINE, _PAPER = "#1b2229", "#5a6570", "#e2ded3", "#fffefb"
-_MEASURED, _SIMULATED, _HELD_OUT, _STEERED = "#8796a3", "#c4400f", "#7a5ba8", "#0069a8"
+_HELD_OUT = "#7a5ba8"
 _WIDTH_IN, _STRIP_IN, _FOOT_IN, _DPI = 11.0, 1.35, 0.45, 120
 _LONGEST = 40.0  # s of a log that are drawn
 _MOST_WINDOWS = 40  # in a strip
@@ -491,91 +500,46 @@ def _stretch(run: Mapping[str, Any]) -> tuple[float, float, float]:
 
 def _draw(run: Mapping[str, Any], begin: float, end: float) -> bytes:
     """The run as PNG: a strip a quantity, and the commands."""
-    # Matplotlib takes longer to import than the drawing: who draws nothing does not wait for it.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     strips = len(run["quantities"]) + 1
     height = strips * _STRIP_IN + _FOOT_IN
-    figure = Figure(figsize=(_WIDTH_IN, height), dpi=_DPI, facecolor=_PAPER)
-    canvas = FigureCanvasAgg(figure)
+    figure, canvas = new_figure(_WIDTH_IN, height, _DPI)
     for k, quantity in enumerate([*run["quantities"], None]):
         bottom = (_FOOT_IN + (strips - 1 - k) * _STRIP_IN) / height
         axes = figure.add_axes((0.055, bottom, 0.89, (_STRIP_IN - 0.3) / height))
         axes.set_xlim(begin, end)
-        axes.grid(color=_LINE, linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.set_frame_on(False)
-        axes.tick_params(length=0, labelsize=8.5, labelcolor=_SOFT, labelbottom=quantity is None)
+        dress(axes, 8.5)
+        axes.tick_params(labelbottom=quantity is None)
         if quantity is None:
-            _draw_commands(axes, run["commands"])
-            title = "throttle, %"
+            commands = run["commands"]
+            time, throttle, steering = (
+                _array(commands[name]) for name in ("time", "throttle", "steering_deg")
+            )
+            draw_commands(axes, time, throttle, steering, 8.5)
+            title = "commands"
         else:
-            _draw_quantity(axes, quantity, begin, end)
+            time, measured = _array(quantity["time"]), _array(quantity["measured"])
+            draw_windows(axes, time, measured, _predictions(quantity, begin, end))
             title = ", ".join(QUANTITIES.get(quantity["name"], (str(quantity["name"]),)))
         # A dollar sign in a name is no formula.
         axes.set_title(
-            title, color=_INK, size=9.5, weight="bold", loc="left", pad=4, parse_math=False
+            title, color=INK, size=9.5, weight="bold", loc="left", pad=4, parse_math=False
         )
         axes.locator_params(axis="y", nbins=4)
-    axes.set_xlabel("time, s", color=_SOFT, size=8.5)
+    axes.set_xlabel("time, s", color=SOFT, size=8.5)
     file = io.BytesIO()
     canvas.print_png(file)
     return file.getvalue()
 
 
-def _draw_quantity(axes: "Axes", quantity: Mapping[str, Any], begin: float, end: float) -> None:
-    """Measured over the stretch, and simulated in as many windows as can be told apart."""
-    time, measured = _array(quantity["time"]), _array(quantity["measured"])
-    axes.plot(time, measured, color=_MEASURED, linewidth=2.4, zorder=2)
-    seen = _finite(measured[(time >= begin) & (time <= end)])
+def _predictions(quantity: Mapping[str, Any], begin: float, end: float) -> Iterator[Prediction]:
+    """As many windows as can be told apart."""
     free = begin
-    predicted = []
     for window in sorted(quantity["windows"], key=lambda window: min(window["time"], default=0.0)):
         at, simulated = _array(window["time"]), _array(window["simulated"])
         if not len(at) or at[0] < free or at[-1] > end + 1e-9:
             continue
         free = max(float(at[-1]) - 1e-6, float(at[0]) + (end - begin) / _MOST_WINDOWS)
-        colour = _HELD_OUT if window["held_out"] else _SIMULATED
-        axes.plot(at, simulated, color=colour, linewidth=1.5, zorder=3)
-        axes.plot(at[:1], simulated[:1], "o", color=colour, markersize=3.4, zorder=3)
-        predicted.append(_finite(simulated))
-    if len(seen):  # a prediction that runs away must not flatten what was measured
-        reach = max(float(np.ptp(seen)), 0.1)
-        predicted = [np.clip(p, seen.min() - reach, seen.max() + reach) for p in predicted]
-    shown = np.concatenate([seen, *predicted])
-    if not len(shown):
-        axes.text(
-            0.5, 0.5, "not measured", transform=axes.transAxes, color=_SOFT, ha="center", size=9
-        )
-        return
-    margin = 0.06 * max(float(np.ptp(shown)), 0.1)
-    axes.set_ylim(shown.min() - margin, shown.max() + margin)
-
-
-def _draw_commands(axes: "Axes", commands: Mapping[str, Any]) -> None:
-    """Throttle on the left scale and steering on the right one."""
-    time = _array(commands["time"])
-    throttle, steering = 100 * _array(commands["throttle"]), _array(commands["steering_deg"])
-    axes.step(time, throttle, where="post", color=_INK, linewidth=1.3)
-    most = max(100.0, float(np.max(np.abs(_finite(throttle)), initial=0.0)))
-    negative = bool(np.any(throttle < 0))
-    axes.set_ylim((-1.06 if negative else -0.06) * most, 1.06 * most)
-    right = axes.twinx()
-    right.step(time, steering, where="post", color=_STEERED, linewidth=1.3)
-    most = max(10.0, float(np.max(np.abs(_finite(steering)), initial=0.0)))
-    right.set_ylim(-1.08 * most, 1.08 * most)
-    right.set_frame_on(False)
-    right.tick_params(length=0, labelsize=8.5, labelcolor=_STEERED)
-    right.set_title(
-        "steering asked for, °, left positive",
-        color=_STEERED,
-        size=9.5,
-        weight="bold",
-        loc="right",
-        pad=4,
-    )
-    right.locator_params(axis="y", nbins=4)
+        yield Prediction(at, simulated, _HELD_OUT if window["held_out"] else SIMULATED)
 
 
 # -------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from countersteer.errors import InputError
-from countersteer.runs.files import COMMANDS
+from countersteer.runs.files import COMMANDS, require
 from countersteer.runs.recorder import Recorder, new_folder
 
 FULL_LOCK = 36.0  # degrees of the front wheels that a steering of 1 nominally asks for
@@ -112,20 +112,17 @@ def _read(log: Path) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"{log}: cannot be read: {error.strerror or error}") from None
     except (zipfile.BadZipFile, ValueError, EOFError, KeyError):
         raise InputError(f"{log}: not an ETH log: it is no .npz file of numbers") from None
+
+    def place(row: int) -> str:
+        return f"{log}, row {row} ({row * PERIOD:.2f} s)"
+
     for name, array, width in (("obs", observed, OBSERVED), ("action", asked, ASKED)):
         if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
             raise InputError(f"{log}: not an ETH log: '{name}' must be numbers (N, {width})")
-        _all(log, np.all(np.isfinite(array), axis=1), f"{name} is not a number")
+        require(place, np.all(np.isfinite(array), axis=1), f"{name} is not a number")
     if len(observed) != len(asked) or len(observed) < 2:
         raise InputError(
             f"{log}: 'obs' and 'action' must be as long as each other, two rows or more"
         )
-    _all(log, np.all(np.abs(asked) <= 1, axis=1), "action must be in [-1, 1]")
+    require(place, np.all(np.abs(asked) <= 1, axis=1), "action must be in [-1, 1]")
     return observed.astype(float), asked.astype(float)
-
-
-def _all(log: Path, good: np.ndarray, message: str) -> None:
-    """Raise `InputError` with the first row that is not good, and its time."""
-    if not np.all(good):
-        row = int(np.argmin(good))
-        raise InputError(f"{log}, row {row} ({row * PERIOD:.2f} s): {message}")

@@ -1,0 +1,49 @@
+"""What came of an evaluation, as a picture."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from countersteer.batch.evaluate import DRIFT
+from countersteer.task.task import Outcome, Score
+
+
+def draw_evaluation(scores: Mapping[str, Score], title: str, path: Path) -> None:
+    """A picture: heading errors and peak sideslip of all turns, and lap times, by driver.
+
+    A turn that ended in the midst of a spin counts to the bin at the end.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (errors, slips, laps) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
+    for name, score in scores.items():
+        won, turns = score.outcome == Outcome.REACHED.code, score.turns
+        if not np.any(won):
+            continue
+        counted = won[:, None] & np.isfinite(turns.begin)
+        drawn = {"histtype": "step", "linewidth": 1.5, "label": name}
+        for axes, values, bins in (
+            (errors, np.degrees(turns.error[counted]), np.linspace(-10, 10, 41)),
+            (slips, np.degrees(turns.peak_sideslip[counted]), np.linspace(0, 70, 36)),
+        ):
+            axes.hist(np.clip(values, bins[0], bins[-1]), bins=bins, **drawn)
+        laps.hist(score.goal_time[won], bins=40, **drawn)
+    slips.axvline(math.degrees(DRIFT), color="grey", linewidth=0.8)
+    for axes, name in (
+        (errors, "heading error at a turn's end, ° (ends: and beyond)"),
+        (slips, "peak sideslip of a turn, ° (end: and beyond)"),
+        (laps, "time to the goal, s"),
+    ):
+        axes.set_xlabel(name)
+    errors.set_ylabel("turns of successes")
+    laps.set_ylabel("successes")
+    if errors.get_legend_handles_labels()[0]:
+        errors.legend(frameon=False, fontsize=8)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
