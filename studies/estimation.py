@@ -31,7 +31,7 @@ from countersteer.drivers.driver import Driver
 from countersteer.drivers.straighten import straighten
 from countersteer.estimation.pose import PoseFilter
 from countersteer.link.link import ONBOARD
-from countersteer.sensing.faults import KINDS, Fault
+from countersteer.sensing.faults import KINDS, SensorFault
 from countersteer.task.task import PERIOD, Outcome, Score
 from countersteer.world import battery
 from countersteer.world.walls import padded
@@ -258,7 +258,7 @@ def failing(
 
     def run(which: np.ndarray, starts: np.ndarray, seeds: np.ndarray) -> Score:
         faults = tuple(
-            Fault(sensor=s, kind=k, start=starts, duration=np.where(which == i, FAULT, 0.0))
+            SensorFault(sensor=s, kind=k, start=starts, duration=np.where(which == i, FAULT, 0.0))
             for i, (s, k) in enumerate(pairs)
         )
         own = trials(course, car, seeds.tolist())

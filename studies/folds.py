@@ -74,7 +74,7 @@ def cross_validate(
         for part in (held, thin):
             known = np.unique(part.run)
             charge[known] = fit.estimated_charge(found.cars, part.shots)[known]
-        for run, errors in judged(found.cars, held.charged(charge)).items():
+        for run, errors in judged(found.cars, held.with_charge(charge)).items():
             parts.setdefault(run, []).append(errors)
         for run in np.setdiff1d(held.run, fitted.run):
             surface = tune.surface_of(logs.runs[run], found.cars, base)

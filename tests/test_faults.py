@@ -10,7 +10,7 @@ import pytest
 
 from countersteer import cli
 from countersteer.errors import InputError
-from countersteer.runs.defects import faults, refuse, repaired
+from countersteer.runs.defects import find_defects, refuse, repair
 from countersteer.runs.files import Table
 from countersteer.runs.importers.dart import import_dart
 from countersteer.runs.importers.eth import import_eth
@@ -398,12 +398,12 @@ REFUSED: dict[str, tuple[Callable[[Run], Run], str]] = {
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("kind", [lambda r: r, without_truth, with_velocities])
 def test_nothing_is_found_in_a_good_log(seed, kind):
-    assert faults(kind(good(seed))) == []
+    assert find_defects(kind(good(seed))) == []
 
 
 def check(run: Run, name: str) -> None:
     inject, words, column, at = FAULTS[name]
-    found = faults(inject(run))
+    found = find_defects(inject(run))
     named = [fault for fault in found if words in fault.what]
     assert named, found
     assert all(fault.column == column for fault in named)
@@ -418,7 +418,7 @@ def test_a_fault_is_found_where_it_is(name):
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_brings_no_false_alarm_elsewhere(name):
     inject, words, _, at = FAULTS[name]
-    for fault in faults(inject(good())):
+    for fault in find_defects(inject(good())):
         assert words in fault.what or fault.start - 0.3 <= at <= fault.end + 0.3, fault
 
 
@@ -427,7 +427,7 @@ def test_a_column_that_means_something_else_is_refused(name):
     inject, words = REFUSED[name]
     run = inject(good())
     with pytest.raises(InputError, match=words) as refused:
-        faults(run)
+        find_defects(run)
     assert str(refused.value).startswith("log/")
     assert "\n" not in str(refused.value)
 
@@ -437,14 +437,14 @@ def test_a_heading_that_wraps_is_unwrapped_and_said():
     wrapped = changed(
         run, "truth", heading_rad=lambda t: (t["heading_rad"] + np.pi) % (2 * np.pi) - np.pi
     )
-    mended, lines = repaired(wrapped)
+    mended, lines = repair(wrapped)
     turns = mended.truth["heading_rad"] - run.truth["heading_rad"]
     np.testing.assert_allclose(turns, turns[0], atol=1e-9)
     assert len(lines) == 1
     assert "log/truth.csv: heading_rad wraps" in lines[0]
     assert "unwrapped" in lines[0]
-    assert faults(wrapped) == []
-    assert repaired(run) == (run, [])
+    assert find_defects(wrapped) == []
+    assert repair(run) == (run, [])
 
 
 def test_wheels_that_spin_and_a_gyroscope_at_its_reach_are_not_stuck():
@@ -457,19 +457,19 @@ def test_wheels_that_spin_and_a_gyroscope_at_its_reach_are_not_stuck():
         wheel_speed_mps=held("wheel_speed_mps", 5.6, 8.4, 3.28),
         gyro_radps=clipped,
     )
-    assert faults(spins) == []
+    assert find_defects(spins) == []
 
 
 def test_only_a_wall_is_found_in_what_the_simulator_drove(tmp_path):
     for arguments in (["box"], ["straight", "--driver", "straighten"]):
         out = tmp_path / arguments[0]
         assert cli.main(["drive", *arguments, "--json", "--out", str(out)]) == 0
-        assert faults(read_run(out)) == []
+        assert find_defects(read_run(out)) == []
     steps = tmp_path / "into-the-wall.csv"
     steps.write_text("time_s,throttle,direction,steering_deg\n0,0.5,forward,0\n4,0,forward,0\n")
     out = tmp_path / "hit"
     cli.main(["drive", "box", "--driver", str(steps), "--json", "--out", str(out)])
-    found = faults(read_run(out))
+    found = find_defects(read_run(out))
     assert len(found) >= 1
     assert all("a collision" in fault.what for fault in found)
 
@@ -485,7 +485,7 @@ def test_the_dart_logs_are_clean_but_for_the_dead_man_switch(tmp_path):
     assert len(logs) >= 30
     for log in logs:
         run = read_run(Path(import_dart(log, tmp_path / log.parent.name)["run"]))
-        for fault in faults(run):
+        for fault in find_defects(run):
             ends = fault.end in (run.truth["time_s"][[0, -1]] if run.truth else ())
             assert "dead-man" in fault.what or (ends and "is empty" in fault.what), (log, fault)
 
@@ -495,7 +495,7 @@ def test_in_the_eth_logs_the_car_hits_something_three_times(tmp_path):
     hits = []
     for name in ("train_1", "train_2"):
         import_eth(DATA / "eth_rccar" / f"{name}.npz", tmp_path)
-        for fault in faults(read_run(tmp_path / name)):
+        for fault in find_defects(read_run(tmp_path / name)):
             if "a collision" in fault.what:
                 hits.append((name, round(fault.start)))
             else:
@@ -529,8 +529,8 @@ REAL: dict[str, tuple[Callable[[Run], Run], str]] = {
 @pytest.mark.parametrize("name", REAL)
 def test_a_fault_put_into_a_real_log_is_found_and_alone(drift, name):
     inject, words = REAL[name]
-    before = faults(drift)
-    fresh = [fault for fault in faults(inject(drift)) if fault not in before]
+    before = find_defects(drift)
+    fresh = [fault for fault in find_defects(inject(drift)) if fault not in before]
     assert fresh
     assert all(words in fault.what for fault in fresh), fresh
 

@@ -54,7 +54,7 @@ def test_the_same_car_is_not_learned_again(runs):
     assert not found["learn_again"], found
     assert found["threshold"] > 1
     assert found["gain"] == pytest.approx(0)
-    assert "learn the driver again: no." in relearn.said(found)
+    assert "learn the driver again: no." in relearn.verdict(found)
 
 
 def test_a_car_whose_tyres_wore_is_learned_again(runs, tmp_path, capsys):
@@ -71,8 +71,8 @@ def test_a_car_whose_tyres_wore_is_learned_again(runs, tmp_path, capsys):
     assert found["refit"]["error"] < found["refit"]["error_before"]
     assert 0 < found["gain"] < 1
     assert {"run-1", "run-5"} <= {run["run"] for run in told["runs"]}
-    assert found["said"].startswith("learn the driver again: yes.")
-    assert found["said"] in out.with_suffix(".html").read_text()
+    assert found["verdict"].startswith("learn the driver again: yes.")
+    assert found["verdict"] in out.with_suffix(".html").read_text()
 
 
 def test_what_sets_new_runs_apart_is_their_error_and_not_what_was_driven(runs):

@@ -18,7 +18,7 @@ from countersteer.drivers.drift_turn import drift_turn
 from countersteer.link.link import RADIO
 from countersteer.pilot import Pilot
 from countersteer.sensing import faults, suite
-from countersteer.sensing.faults import KINDS, Fault
+from countersteer.sensing.faults import KINDS, SensorFault
 from countersteer.signals import Reading, Readings, flat, pairs
 from countersteer.simulator import Record, Simulator, scan
 
@@ -39,10 +39,10 @@ DT, LATE = 1e-3, 1e6
 START, END = 0.8, 1.3  # s: the car drives straight on, at speed
 
 
-def failing(*which: tuple[str, str]) -> tuple[Fault, ...]:
+def failing(*which: tuple[str, str]) -> tuple[SensorFault, ...]:
     """A fault of every sensor and kind, so that there is one program; only these come to pass."""
     return tuple(
-        Fault(
+        SensorFault(
             sensor=sensor,
             kind=kind,
             start=START if (sensor, kind) in which else LATE,
@@ -52,7 +52,7 @@ def failing(*which: tuple[str, str]) -> tuple[Fault, ...]:
     )
 
 
-def drive(which: tuple[Fault, ...], seconds: float = 2.0, **more: object) -> Record:
+def drive(which: tuple[SensorFault, ...], seconds: float = 2.0, **more: object) -> Record:
     driver = drift_turn(COURSE, load_car("rx7"), None, 1)
     return driven(COURSE, CAR, driver, seconds, faults=which, **more)
 
@@ -112,7 +112,7 @@ def test_without_faults_there_is_nothing_of_them_in_the_loop() -> None:
 
 
 def test_faults_come_before_the_radio() -> None:
-    dead = (Fault(sensor="sonar", kind="dead", start=0.0, duration=np.inf),)
+    dead = (SensorFault(sensor="sonar", kind="dead", start=0.0, duration=np.inf),)
     pilot = Pilot.of(drift_turn(COURSE, CAR, None, 1), COURSE, CAR, link=RADIO)
     simulator = Simulator.of(COURSE, CAR, link=RADIO, faults=dead)
     with jax.enable_x64(True):

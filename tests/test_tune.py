@@ -158,19 +158,19 @@ def test_how_full_a_battery_was_is_found_where_the_log_does_not_tell(logs, tmp_p
     found = fit.estimated_charge(cars, windows.shots)
     np.testing.assert_allclose(found, [0.9, 0.3, 0.3], atol=0.03)
     compared, _ = compare(untold[1], true, 1.0, 0.002)
-    assert not compared["battery_told"]
+    assert not compared["battery_known"]
     assert compared["battery_charge"] == pytest.approx(0.3, abs=0.03)
     full = compared["as_if_full"]["rmse"]["wheel_speed_mps"]
     assert compared["rmse"]["wheel_speed_mps"] < full / 3
     told, _ = compare(runs[1], true, 1.0, 0.002)
-    assert told["battery_told"]
+    assert told["battery_known"]
     assert "as_if_full" not in told
 
 
 def test_logs_count_alike_however_many_windows_they_have(windows, logs):
     """A log given with every window twice weighs what it weighed."""
     _, cars = logs
-    twice = fit.taken(
+    twice = fit.select(
         windows.shots, np.repeat(np.arange(len(windows.start)), 1 + (windows.run == 0))
     )
     for shots in (windows.shots, twice):

@@ -22,7 +22,7 @@ from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
 from countersteer.runs.files import read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
-from countersteer.sensing.faults import Fault, fault_tables
+from countersteer.sensing.faults import SensorFault, fault_tables
 from countersteer.sensing.suite import channels
 from countersteer.signals import Motion, Wheels, truth_columns
 from countersteer.simulator import PIECE, Record, Simulator
@@ -57,7 +57,7 @@ def prepare(
     charge: float = 1.0,
     start: tuple[float, float, float] | None = None,
     floor: Floor | None = None,
-    faults: tuple[Fault, ...] = (),
+    faults: tuple[SensorFault, ...] = (),
 ) -> Drive:
     """A drive of a car round a course, by a driver's name or file, who knows the car `car_name`.
 

@@ -28,7 +28,7 @@ from countersteer.link.link import ONBOARD, Link, Packets, exchange, initial_pac
 from countersteer.pilot import Pilot, PilotMemory
 from countersteer.sensing import faults as failing
 from countersteer.sensing import sonar, suite
-from countersteer.sensing.faults import Fault
+from countersteer.sensing.faults import SensorFault
 from countersteer.signals import Array, Command, Motion, Readings, Scalar
 from countersteer.streams import Stream
 from countersteer.world import drivetrain, motor
@@ -86,7 +86,7 @@ class Simulator:
     velocity: tuple[Scalar, Scalar, Scalar]  # vx, vy, yaw rate
     charge: Scalar  # of the battery
     seed: Scalar
-    faults: tuple[Fault, ...]
+    faults: tuple[SensorFault, ...]
     link: Link = dataclasses.field(metadata={"static": True})
     every: suite.Periods = dataclasses.field(metadata={"static": True})
     slots: int = dataclasses.field(metadata={"static": True})  # poses kept for a late sensor
@@ -104,7 +104,7 @@ class Simulator:
         velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         start: tuple[float, float, float] | None = None,
         floor: Floor | None = None,
-        faults: tuple[Fault, ...] = (),
+        faults: tuple[SensorFault, ...] = (),
         world: MakeWorld = planar,
     ) -> "Simulator":
         """A car on a course (None: open floor), at the course's start unless `start` is given.
@@ -221,8 +221,8 @@ def begin(simulator: Simulator) -> Loop:
 
 def heard(simulator: Simulator, loop: Loop) -> Readings:
     """`Simulator.readings`, for use under `jit`."""
-    told: Readings = loop.readings if loop.down is None else loop.down.latest
-    return told._replace(truth=simulator.world.motion(loop.state))
+    latest: Readings = loop.readings if loop.down is None else loop.down.latest
+    return latest._replace(truth=simulator.world.motion(loop.state))
 
 
 def advance(
@@ -296,12 +296,12 @@ def tick(
     def act(memory: PilotMemory) -> PilotMemory:
         return pilot.act(memory, heard(simulator, loop), loop.tick)[1]
 
-    said = pilot.status(memory)
+    status = pilot.status(memory)
     # Also where each tick has a decision: what is compiled apart comes to the same digits.
     now = loop.tick % pilot.control == 0 if pilot.control > 1 else loop.tick >= 0
     memory = jax.lax.cond(now, act, lambda same: same, memory)
     loop, record = advance(simulator, loop, memory.command, now)
-    return loop, memory, record._replace(status=said)
+    return loop, memory, record._replace(status=status)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -324,12 +324,12 @@ def steps(
     """The same with any pilot, a decision at a time."""
     records = []
     for _ in range(ticks // pilot.control):
-        said = pilot.status(memory)
+        status = pilot.status(memory)
         command, memory = pilot.act(memory, simulator.readings(loop), loop.tick)
         loop, record = simulator.apply(loop, command, pilot.control)
         status = jax.tree.map(
             lambda before, after: np.array([before, *[after] * (pilot.control - 1)]),
-            said,
+            status,
             pilot.status(memory),
         )
         records.append(jax.tree.map(np.asarray, record)._replace(status=status))

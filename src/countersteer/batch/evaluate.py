@@ -16,7 +16,7 @@ from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.link.link import Link
 from countersteer.pilot import Pilot
-from countersteer.sensing.faults import Fault
+from countersteer.sensing.faults import SensorFault
 from countersteer.task.task import Outcome, Score
 
 DRIFT = math.radians(25)  # sideslip that makes a turn a drift
@@ -54,7 +54,7 @@ class Trials:
         make: Callable[[float | None], Driver],
         watch: Watch | None,
         report: Callable[[int, int], None] = lambda *_: None,
-        faults: tuple[Fault, ...] = (),
+        faults: tuple[SensorFault, ...] = (),
         lanes: int = LANES,
     ) -> tuple[Score, Any]:
         """The same with what `watch` has kept, and with sensors that fail as each trial's do."""

@@ -24,7 +24,7 @@ from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot, PilotMemory
 from countersteer.sensing import suite
-from countersteer.sensing.faults import Fault
+from countersteer.sensing.faults import SensorFault
 from countersteer.signals import Array, Scalar
 from countersteer.simulator import Loop, Simulator, begin, tick
 from countersteer.task.task import PERIOD, Outcome, Sample, Score, Task
@@ -43,7 +43,7 @@ class Trial(NamedTuple):
     pose: Array  # (n, 3)
     floor: Floor | None
     seed: Array
-    faults: tuple[Fault, ...] = ()  # starts and durations are each trial's
+    faults: tuple[SensorFault, ...] = ()  # starts and durations are each trial's
 
 
 class Shared(NamedTuple):
@@ -161,7 +161,7 @@ def run_trials(
     watch: Watch | None = None,
     report: Callable[[int, int], None] = lambda *_: None,
     lanes: int | None = None,
-    faults: tuple[Fault, ...] = (),
+    faults: tuple[SensorFault, ...] = (),
     link: Link = ONBOARD,
 ) -> tuple[Score, Any]:
     """One trial for each seed: its score, and what `watch` has kept (`()` without one).

@@ -130,7 +130,7 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) ->
     if options.json:
         print(json.dumps(result))
         return DONE
-    if not result["battery_told"]:
+    if not result["battery_known"]:
         print(
             f"battery: the log does not tell; {result['battery_charge']:.2f} of a full one agrees "
             "best (--battery sets it)"

@@ -149,7 +149,7 @@ def tune_all(
     for line in tune.table_lines(about):
         print(line)
     if new:
-        print(about["new_runs"]["said"])
+        print(about["new_runs"]["verdict"])
     print(f"cars: {', '.join(map(str, files.values()))}; page: {page}")
     return DONE
 

@@ -66,16 +66,16 @@ def correct(
     n = len(mean)
     across = [sum(a * entry(covariance, i, k) for k, a in row.items()) for i in range(n)]
     spread = sum(a * across[k] for k, a in row.items()) + noise
-    taken = valid & (residual**2 <= gate**2 * spread)
-    weight = jnp.where(taken, 1 / spread, 0.0)
-    residual = jnp.where(taken, residual, 0.0)
+    accepted = valid & (residual**2 <= gate**2 * spread)
+    weight = jnp.where(accepted, 1 / spread, 0.0)
+    residual = jnp.where(accepted, residual, 0.0)
     gain = [a * weight for a in across]
     return (
         tuple(m + g * residual for m, g in zip(mean, gain, strict=True)),
         tuple(
             tuple(covariance[i][j - i] - gain[i] * across[j] for j in range(i, n)) for i in range(n)
         ),
-        taken,
+        accepted,
     )
 
 

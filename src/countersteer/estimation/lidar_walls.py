@@ -64,14 +64,14 @@ def line_up(
     lever = ends.along - middle
     arm = jnp.sum(weight * lever**2) + 1e-6
     slope = jnp.sum(weight * lever * off) / arm
-    taken = fresh & (count > FEWEST)
+    accepted = fresh & (count > FEWEST)
     noise = ALIKE * (part.noise**2 + part.resolution**2 / 12 + 1e-8)
     before = mean[1]
     mean, covariance, first = correct(
-        mean, covariance, {0: 1.0, 1: middle}, residual, noise / count, taken, gate
+        mean, covariance, {0: 1.0, 1: middle}, residual, noise / count, accepted, gate
     )
     mean, covariance, second = correct(
-        mean, covariance, {1: 1.0}, slope - (mean[1] - before), noise / arm, taken, gate
+        mean, covariance, {1: 1.0}, slope - (mean[1] - before), noise / arm, accepted, gate
     )
     return mean, covariance, first & second
 

@@ -156,7 +156,7 @@ class WallAngle:
             vague = entry(covariance, OFFSET, OFFSET) > (2 * COARSE) ** 2
             cosine, sine = jnp.cos(mean[ANGLE]), jnp.sin(mean[ANGLE])
             seen = side * (self.width / 2 - sonar[mount].value)
-            mean, covariance, taken = correct(
+            mean, covariance, accepted = correct(
                 mean,
                 covariance,
                 {OFFSET: 1.0, ANGLE: x * cosine - y * sine},
@@ -169,9 +169,9 @@ class WallAngle:
                 & (jnp.abs(estimate.yaw_rate) < TURNING),
                 GATE,
             )
-            believed = jnp.where(taken, time, believed)
+            believed = jnp.where(accepted, time, believed)
         if self.lidar is not None and scan is not None:
-            mean, covariance, taken = lidar_walls.line_up(
+            mean, covariance, accepted = lidar_walls.line_up(
                 self.lidar,
                 self.width,
                 mean,
@@ -180,7 +180,7 @@ class WallAngle:
                 (scan_age < h - ROUNDING) & (jnp.abs(mean[ANGLE]) < SCANNED),
                 GATE,
             )
-            believed = jnp.where(taken, time, believed)
+            believed = jnp.where(accepted, time, believed)
         # Long without a believed reading: rather believe too little than shut them all out.
         lost = jnp.where(time - believed > FORGETS, (0.3 * self.width) ** 2 * h, 0.0)
         covariance = predict(covariance, {}, {OFFSET: lost})

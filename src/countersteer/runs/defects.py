@@ -1,11 +1,8 @@
 """What is false in a log: stretches that a fit must leave out, and logs that it must refuse.
 
-`refuse` raises where a whole column cannot mean what its name says; `faults` lists stretches; and
-`repaired` mends what can be mended without a guess. All three take any run: an imported log, one of
-our simulator, a real car's. What a log does not hold is not judged.
-
-A sensor is called stuck only where something else in the log contradicts it: a constant reading
-alone is what a car at a constant speed gives.
+`refuse` raises where a whole column cannot mean what its name says. `find_defects` lists stretches.
+`repair` mends what can be mended without a guess. All three take any run: an imported log, one of
+the simulator, a real car's. What a log does not hold is not judged.
 """
 
 import dataclasses
@@ -62,7 +59,7 @@ UNITS = {
 TELLING = 20  # samples that a ratio is concluded from
 
 
-class Fault(NamedTuple):
+class LogDefect(NamedTuple):
     """A stretch of a log that says what was not so."""
 
     start: float  # s
@@ -87,13 +84,13 @@ class Track(NamedTuple):
         return np.interp(time, self.time, values, left=math.nan, right=math.nan)
 
 
-def faults(run: Run) -> list[Fault]:
+def find_defects(run: Run) -> list[LogDefect]:
     """Stretches of the run that a fit must leave out, by time.
 
     Raises `InputError`, naming file and time, where the log cannot be used at all.
     """
     refuse(run)
-    run, _ = repaired(run)
+    run, _ = repair(run)
     found = [*gaps(run), *missing(run), *released(run)]
     track = None
     if run.truth is not None:
@@ -106,7 +103,7 @@ def faults(run: Run) -> list[Fault]:
     return sorted(found)
 
 
-def repaired(run: Run) -> tuple[Run, list[str]]:
+def repair(run: Run) -> tuple[Run, list[str]]:
     """The run with its heading unwrapped, and a line for each repair; the same run if none."""
     truth = run.truth
     if truth is None or not len(truth):
@@ -159,7 +156,7 @@ def readings(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
 # -------------------------------------------------------------------------------------------------
 
 
-def gaps(run: Run) -> Iterator[Fault]:
+def gaps(run: Run) -> Iterator[LogDefect]:
     """Rows, or reports of one sensor, that come too late or twice at once."""
     tables = {"commands": run.commands, "telemetry": run.telemetry, "truth": run.truth}
     for name, table in tables.items():
@@ -168,20 +165,20 @@ def gaps(run: Run) -> Iterator[Fault]:
         yield from _late(table["time_s"], f"{name}.csv has no rows", "")
         for i in np.flatnonzero(np.diff(table["time_s"]) <= 0).tolist():
             at = float(table["time_s"][i])
-            yield Fault(at, at, f"{name}.csv has two rows at one time")
+            yield LogDefect(at, at, f"{name}.csv has two rows at one time")
     for name in run.telemetry or ():
         if name != "time_s":
             yield from _late(readings(run, name)[0], f"{name} reports nothing", name)
 
 
-def _late(time: np.ndarray, what: str, column: str) -> Iterator[Fault]:
+def _late(time: np.ndarray, what: str, column: str) -> Iterator[LogDefect]:
     every = period(time)
     for i in np.flatnonzero(np.diff(time) > MISSED * every).tolist():
         start, end = float(time[i]), float(time[i + 1])
-        yield Fault(start, end, f"{what} for {end - start:.2f} s", column)
+        yield LogDefect(start, end, f"{what} for {end - start:.2f} s", column)
 
 
-def missing(run: Run) -> Iterator[Fault]:
+def missing(run: Run) -> Iterator[LogDefect]:
     """Columns that hold nothing, cells of motion capture that do not, and infinite values."""
     for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
         if table is None or not len(table):
@@ -191,23 +188,25 @@ def missing(run: Run) -> Iterator[Fault]:
             infinite = np.isinf(values) & (not column.startswith("sonar_"))
             for first, last in stretches(infinite):
                 span = float(time[first]), float(time[last])
-                yield Fault(*span, f"{column} is infinite in {name}.csv", column)
+                yield LogDefect(*span, f"{column} is infinite in {name}.csv", column)
             nothing = np.isnan(values)
             if np.all(nothing) and len(values) >= ROWS:
-                yield Fault(
+                yield LogDefect(
                     float(time[0]), float(time[-1]), f"{column} of {name}.csv is empty", column
                 )
             elif name == "truth":
                 for first, last in stretches(nothing):
-                    yield Fault(float(time[first]), float(time[last]), f"{column} is empty", column)
+                    yield LogDefect(
+                        float(time[first]), float(time[last]), f"{column} is empty", column
+                    )
 
 
-def released(run: Run) -> Iterator[Fault]:
+def released(run: Run) -> Iterator[LogDefect]:
     """While the dead-man switch is open, what was asked is not what the motor got."""
     time, armed = readings(run, "armed")
     for first, last in stretches(armed < 0.5):
         end = time[min(last + 1, len(time) - 1)]
-        yield Fault(float(time[first]), float(end), "the dead-man switch is released")
+        yield LogDefect(float(time[first]), float(end), "the dead-man switch is released")
 
 
 # -------------------------------------------------------------------------------------------------
@@ -229,7 +228,7 @@ def usual(time: np.ndarray, rates: np.ndarray) -> np.ndarray:
     return median_filter(rates, width, mode="nearest")
 
 
-def repeated_frames(truth: Table) -> Iterator[Fault]:
+def repeated_frames(truth: Table) -> Iterator[LogDefect]:
     """Frames that are the one before, though the car moves."""
     time, pose = frames(truth)
     if len(time) < ROWS:
@@ -238,7 +237,7 @@ def repeated_frames(truth: Table) -> Iterator[Fault]:
     same = np.all(np.diff(pose, axis=1) == 0, axis=0) & (usual(time, speed) > STANDS)
     for first, last in stretches(same):
         span = float(time[first]), float(time[last + 1])
-        yield Fault(*span, "motion capture repeats a frame while the car moves")
+        yield LogDefect(*span, "motion capture repeats a frame while the car moves")
 
 
 def false_frames(time: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -251,7 +250,7 @@ def false_frames(time: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return np.any(off > np.array([[limit], [limit], [limit_yaw]]), axis=0)
 
 
-def jumps(truth: Table) -> Iterator[Fault]:
+def jumps(truth: Table) -> Iterator[LogDefect]:
     """Frames that the car cannot have been at, or cannot have come to."""
     time, pose = frames(truth)
     if len(time) < ROWS:
@@ -259,7 +258,7 @@ def jumps(truth: Table) -> Iterator[Fault]:
     false = false_frames(time, pose)
     for first, last in stretches(false):
         span = float(time[max(first - 1, 0)]), float(time[min(last + 1, len(time) - 1)])
-        yield Fault(*span, "motion capture has a false frame")
+        yield LogDefect(*span, "motion capture has a false frame")
     time, pose = time[~false], pose[:, ~false]
     span = np.diff(time)
     moved, turned = np.hypot(*np.diff(pose[:2], axis=1)), np.abs(np.diff(pose[2]))
@@ -268,10 +267,10 @@ def jumps(truth: Table) -> Iterator[Fault]:
     round_ = turned > SLACK_YAW + (rate + ABRUPT_YAW) * span
     for i in np.flatnonzero(far | round_).tolist():
         by = f"{moved[i]:.2f} m" if far[i] else f"{math.degrees(turned[i]):.0f}°"
-        yield Fault(float(time[i]), float(time[i + 1]), f"motion capture jumps by {by}")
+        yield LogDefect(float(time[i]), float(time[i + 1]), f"motion capture jumps by {by}")
 
 
-def false_yaw_rates(truth: Table) -> Iterator[Fault]:
+def false_yaw_rates(truth: Table) -> Iterator[LogDefect]:
     """Yaw rates that are not how the heading changes, before nor after."""
     if "yaw_rate_radps" not in truth or len(truth) < ROWS:
         return
@@ -284,7 +283,7 @@ def false_yaw_rates(truth: Table) -> Iterator[Fault]:
     for first, last in stretches(false):
         worst = rate[first : last + 1][np.argmax(np.abs(rate[first : last + 1]))]
         what = f"a yaw rate of {worst:.1f} rad/s is not the heading's"
-        yield Fault(float(time[first]), float(time[last]), what, "yaw_rate_radps")
+        yield LogDefect(float(time[first]), float(time[last]), what, "yaw_rate_radps")
 
 
 def follow(truth: Table) -> Track | None:
@@ -328,7 +327,7 @@ def hardest(run: Run) -> float:
     return MARGIN * GRAVITY * friction
 
 
-def collisions(run: Run, track: Track | None) -> Iterator[Fault]:
+def collisions(run: Run, track: Track | None) -> Iterator[LogDefect]:
     """Where the velocity changes faster than tyres can change it."""
     if track is None:
         return
@@ -347,7 +346,7 @@ def collisions(run: Run, track: Track | None) -> Iterator[Fault]:
     yield from _hits(time[:-step], time[step:], change, hit, "the car is slowed or thrown by")
 
 
-def impacts(run: Run) -> Iterator[Fault]:
+def impacts(run: Run) -> Iterator[LogDefect]:
     """The same from a fast accelerometer, where there is no motion capture."""
     time, ax = readings(run, "accel_x_mps2")
     other, ay = readings(run, "accel_y_mps2")
@@ -362,7 +361,7 @@ def impacts(run: Run) -> Iterator[Fault]:
 
 def _hits(
     begin: np.ndarray, end: np.ndarray, size: np.ndarray, hit: np.ndarray, what: str
-) -> Iterator[Fault]:
+) -> Iterator[LogDefect]:
     """Hits that are closer than their own length are one."""
     found: list[tuple[float, float, float]] = []
     for first, last in stretches(hit):
@@ -372,7 +371,9 @@ def _hits(
             start, worst = found[-1][0], max(worst, found.pop()[2])
         found.append((start, stop, worst))
     for start, stop, worst in found:
-        yield Fault(max(start, 0.0), stop, f"{what} {worst:.0f} m/s², beyond any tyre: a collision")
+        yield LogDefect(
+            max(start, 0.0), stop, f"{what} {worst:.0f} m/s², beyond any tyre: a collision"
+        )
 
 
 # -------------------------------------------------------------------------------------------------
@@ -392,7 +393,7 @@ def longest(time: np.ndarray, where: np.ndarray) -> float:
     return max((float(time[b] - time[a]) for a, b in stretches(where)), default=0.0)
 
 
-def stuck_encoder(run: Run, track: Track | None) -> Iterator[Fault]:
+def stuck_encoder(run: Run, track: Track | None) -> Iterator[LogDefect]:
     """A wheel speed that stays the same though drive and motion say that it cannot."""
     time, speed = readings(run, "wheel_speed_mps")
     if len(time) < ROWS:
@@ -426,10 +427,10 @@ def stuck_encoder(run: Run, track: Track | None) -> Iterator[Fault]:
                 why = "in a turn under drive"
         if why:
             what = f"the encoder stays at {value:.2f} m/s {why}: stuck"
-            yield Fault(float(at[0]), float(at[-1]), what, "wheel_speed_mps")
+            yield LogDefect(float(at[0]), float(at[-1]), what, "wheel_speed_mps")
 
 
-def stuck_gyroscope(run: Run, track: Track | None) -> Iterator[Fault]:
+def stuck_gyroscope(run: Run, track: Track | None) -> Iterator[LogDefect]:
     """A yaw rate that stays the same though the car turns otherwise. At its reach it may."""
     time, rate = readings(run, "gyro_radps")
     if len(time) < ROWS:
@@ -455,7 +456,7 @@ def stuck_gyroscope(run: Run, track: Track | None) -> Iterator[Fault]:
             stuck = bool(long and np.all(moving) and answers and not full)
         if stuck:
             what = f"the gyroscope stays at {value:.2f} rad/s while the car turns otherwise: stuck"
-            yield Fault(float(at[0]), float(at[-1]), what, "gyro_radps")
+            yield LogDefect(float(at[0]), float(at[-1]), what, "gyro_radps")
 
 
 # -------------------------------------------------------------------------------------------------
@@ -550,7 +551,7 @@ def _refuse_truth(run: Run, truth: Table) -> None:
 def _refuse_sensors(run: Run) -> None:
     """Units of encoder and gyroscope: by motion capture, or by what no model car does."""
     file = f"{run.path}/telemetry.csv"
-    track = follow(repaired(run)[0].truth) if run.truth is not None and len(run.truth) else None  # type: ignore[arg-type]  # it has one as this run has
+    track = follow(repair(run)[0].truth) if run.truth is not None and len(run.truth) else None  # type: ignore[arg-type]  # it has one as this run has
     for name, limit in (("wheel_speed_mps", FASTEST), ("gyro_radps", FASTEST_YAW)):
         time, values = readings(run, name)
         beyond = np.abs(values) > limit

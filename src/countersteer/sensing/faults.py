@@ -20,7 +20,7 @@ ASTRAY = 10.0  # m by which a place may seem to be off
 
 
 @pytree
-class Fault:
+class SensorFault:
     """What happens to the readings that a sensor takes within a window of time.
 
     dead: there are none. stuck: each repeats the last one before the window, as a new one. spike:
@@ -33,7 +33,7 @@ class Fault:
     duration: Scalar  # s; inf: for good
 
 
-def check(faults: tuple[Fault, ...], car: Car) -> None:
+def check(faults: tuple[SensorFault, ...], car: Car) -> None:
     """Raises `InputError` where the car has no such sensor, or where there is no such fault."""
     sensors = [channel.sensor for channel in flat(channels(car))]
     known = list(dict.fromkeys((*(["sonar"] if car.sensors.sonar.mounts else []), *sensors)))
@@ -45,7 +45,7 @@ def check(faults: tuple[Fault, ...], car: Car) -> None:
 
 
 def report(
-    faults: tuple[Fault, ...],
+    faults: tuple[SensorFault, ...],
     car: Car,
     last: Readings,
     now: Readings,
@@ -92,7 +92,7 @@ def spike(channel: Channel, value: Array, key: jax.Array) -> Array:
     return jnp.round(drawn) if channel.whole else drawn
 
 
-def read_fault(text: str) -> Fault:
+def read_fault(text: str) -> SensorFault:
     """A fault from `SENSOR KIND START DURATION` (s). Raises `InputError`."""
     words = text.split()
     try:
@@ -105,10 +105,10 @@ def read_fault(text: str) -> Fault:
         ) from None
     if not (0 <= start <= 1e6 and duration > 0):
         raise InputError(f"--fault {text!r}: START must be in [0, 1e+06] s, DURATION above 0 s")
-    return Fault(sensor=sensor, kind=kind, start=start, duration=duration)
+    return SensorFault(sensor=sensor, kind=kind, start=start, duration=duration)
 
 
-def fault_tables(faults: tuple[Fault, ...]) -> list[dict[str, Any]]:
+def fault_tables(faults: tuple[SensorFault, ...]) -> list[dict[str, Any]]:
     """Faults as plain data, for `run.toml`."""
     return [
         {

@@ -32,7 +32,7 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed, declarations
 from countersteer.errors import InputError
-from countersteer.runs import defects as faults
+from countersteer.runs import defects
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 from countersteer.sensing import parts
@@ -235,10 +235,10 @@ def take(run: Run, source: str) -> tuple[Step, list[str]]:
 
     Raises `UnusableError` where it has none that can be used, `InputError` where it is false.
     """
-    stretches = faults.faults(run)
+    stretches = defects.find_defects(run)
     commands = _driven(run)
     onset, end, level = _held(run, commands, source)
-    told = faults.readings(run, SENSORS[source])[1]
+    told = defects.readings(run, SENSORS[source])[1]
     # A detector reports when it meets a line: a sensor that is there, and nothing, is no motion.
     if SENSORS[source] in (run.telemetry or {}) and source != "sonar" and not np.any(told):
         raise UnusableError(NEVER_MOVES, level)
@@ -273,16 +273,16 @@ def take(run: Run, source: str) -> tuple[Step, list[str]]:
 def _driven(run: Run) -> Table:
     """The commands with the throttle that the motor got: none while the dead-man switch is open."""
     time = run.commands["time_s"]
-    at, armed = faults.readings(run, "armed")
-    throttle = faults.asked(run, "throttle", time)
+    at, armed = defects.readings(run, "armed")
+    throttle = defects.asked(run, "throttle", time)
     if len(at):
         time = np.union1d(time, at)
         closed = armed[np.maximum(np.searchsorted(at, time, side="right") - 1, 0)] >= 0.5
-        throttle = np.where(closed, faults.asked(run, "throttle", time), 0.0)
+        throttle = np.where(closed, defects.asked(run, "throttle", time), 0.0)
     return Table(
         time_s=time,
         throttle=throttle,
-        steering=faults.asked(run, "steering", time),
+        steering=defects.asked(run, "steering", time),
     )
 
 
@@ -311,7 +311,7 @@ def _held(run: Run, commands: Table, source: str) -> tuple[float, float, float]:
 
 def _rolls(run: Run, source: str, onset: float) -> bool:
     """Whether the car moves in the half second before."""
-    at, value = faults.readings(run, SENSORS[source])
+    at, value = defects.readings(run, SENSORS[source])
     just = (at > onset - 0.5) & (at <= onset)
     if np.sum(just) < FEWEST:
         return False

@@ -46,7 +46,7 @@ from countersteer.tuning.windows import (
 if TYPE_CHECKING:
     pass
 
-HORIZON = 1.0  # s, unless told
+HORIZON = 1.0  # s, unless given
 SAMPLE = 0.01  # s between the instants at which states are compared
 SLIDE = math.radians(20)  # sideslip that a sliding window reaches
 CHARGED_BY = 128  # windows of a log, at most, that its battery is judged by
@@ -99,9 +99,9 @@ def compare(
             f"{run.path}: no window of {ticks * dt:g} s in which the dead-man switch is closed and "
             f"the car starts at {SLOWEST:g} m/s or more, or from rest with a throttle onset"
         )
-    told = "battery_charge" in run.about
+    known = "battery_charge" in run.about
     full = {**run.about, "battery_charge": fit.FULL}
-    run = run if told else dataclasses.replace(run, about=full)
+    run = run if known else dataclasses.replace(run, about=full)
     whole = horizon is None
     simulation = Simulation(run, car, measured, starts, resting, ticks, dt, whole)
     windows, kept = simulation.windows()
@@ -111,7 +111,7 @@ def compare(
             "wheel_speed_mps and gyro_radps in telemetry.csv"
         )
     charge, as_if_full = float(run.about["battery_charge"]), {}
-    if not told:
+    if not known:
         as_if_full = {"as_if_full": scores(windows)}
         charge = agreeing_charge(run, car, measured, dt)
         windows, kept = simulation.windows(charge)
@@ -121,7 +121,7 @@ def compare(
         "windows": len(windows),
         "horizon_s": round(ticks * dt, 9),
         "battery_charge": charge,
-        "battery_told": told,
+        "battery_known": known,
         **scores(windows),
         **as_if_full,
         "transient": {"windows": len(lively), **scores(lively)},

@@ -28,7 +28,7 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.car.parameter import Declaration, changed, declarations
 from countersteer.errors import InputError
-from countersteer.runs.defects import Fault
+from countersteer.runs.defects import LogDefect
 from countersteer.runs.run import Run
 from countersteer.signals import Array
 from countersteer.tuning import shooting
@@ -209,7 +209,7 @@ def take_shots(
     runs: Sequence[Run],
     cars: dict[str, Car],
     surfaces: Sequence[str],
-    faults: Sequence[list[Fault]],
+    faults: Sequence[list[LogDefect]],
     every: float = 0.25,
 ) -> tuple[Shots, np.ndarray]:
     """All windows of all runs without those that a fault touches, and when they start."""
@@ -227,7 +227,7 @@ def take_shots(
                 shots = without(shots, fault.column, touched)
             else:
                 clean &= ~touched
-        parts.append(taken(shots, clean))
+        parts.append(select(shots, clean))
         starts.append(start[clean])
     if not parts or not sum(len(part.surface) for part in parts):
         raise InputError("no run holds a window of 1 s that can be fitted: driven, and measured")
@@ -527,7 +527,7 @@ def fit(
         if not chosen.any():
             report(f"{name}: no window tells of it")
             continue
-        part = taken(shots, chosen)
+        part = select(shots, chosen)
         if name == what:
             report(f"{what}: {int(chosen.sum())} windows")
             break
@@ -549,14 +549,14 @@ def estimated_charge(cars: dict[str, Car], shots: Shots) -> np.ndarray:
     return problem.charge_at(problem.solve(problem.start, PASSES).x)
 
 
-def charged(shots: Shots, charge: np.ndarray) -> Shots:
+def with_charge(shots: Shots, charge: np.ndarray) -> Shots:
     """The windows of logs of which it is known how full the battery was; others' was full."""
     filled = np.full(max(len(charge), int(shots.run.max()) + 1), FULL)
     filled[: len(charge)] = charge
     return shots._replace(charge=filled[shots.run])
 
 
-def taken(shots: Shots, chosen: np.ndarray) -> Shots:
+def select(shots: Shots, chosen: np.ndarray) -> Shots:
     """Some of the windows."""
     return jax.tree.map(lambda leaf: leaf[chosen], shots)
 
@@ -658,19 +658,19 @@ def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarr
     """
     rank = np.argsort(np.argsort(whole.shots.run, kind="stable"))
     eighth = rank * 8 // len(rank)
-    ends, told = np.tile(u, (2, 1)), np.full(len(u), True)
+    ends, known = np.tile(u, (2, 1)), np.full(len(u), True)
     for half, end in enumerate(ends):
         problem = Problem(
             whole.cars,
-            taken(whole.shots, eighth % 2 == half),
+            select(whole.shots, eighth % 2 == half),
             list(dict.fromkeys(p.path for p in whole.parameters)),
             charge=whole.charge_at(u),
         )
         place = np.array([whole.parameters.index(p) for p in problem.parameters], int)
         free = determined[place]
         end[place[free]] = Held(problem, free).solve(u[place[free]], 12).x
-        told &= np.isin(np.arange(len(u)), place)
-    return np.where(told, np.abs(ends[1] - ends[0]) / 2, 0.0)
+        known &= np.isin(np.arange(len(u)), place)
+    return np.where(known, np.abs(ends[1] - ends[0]) / 2, 0.0)
 
 
 def errors(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:

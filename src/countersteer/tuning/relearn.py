@@ -73,7 +73,7 @@ def optimism(cars: dict[str, Car], shots: Shots, piece: np.ndarray, free: tuple[
     """Mean e of windows by cars fitted to the other half of the pieces, less that by their own."""
     cars_of = []
     for half in (0, 1):
-        problem = fit.Problem(cars, fit.taken(shots, piece % 2 == half), free)
+        problem = fit.Problem(cars, fit.select(shots, piece % 2 == half), free)
         cars_of.append(problem.cars_at(problem.solve(problem.start, PASSES).x))
     errors = np.stack([window_errors(found, shots) for found in cars_of])
     own = np.arange(len(piece)), piece % 2
@@ -103,7 +103,7 @@ def judge(
             f"--new: the old runs hold {len(old.start)} windows, of the {2 * PIECES} at least "
             "that tell what is usual"
         )
-    old, new = (logs.charged(fit.estimated_charge(before, logs.shots)) for logs in (old, new))
+    old, new = (logs.with_charge(fit.estimated_charge(before, logs.shots)) for logs in (old, new))
     report(f"the car before, on {len(old.start)} old and {len(new.start)} new windows")
     on_old, on_new = (window_errors(before, logs.shots) for logs in (old, new))
     kind_old, kind_new = kinds(old.shots), kinds(new.shots)
@@ -126,7 +126,7 @@ def judge(
     judged = fit.blocks(new.start, new.run) == 2 if hold_out else np.full(len(new.start), True)
     hold_out = hold_out and bool(judged.any())
     judged |= not hold_out
-    refitted = window_errors(after, fit.taken(new.shots, judged))
+    refitted = window_errors(after, fit.select(new.shots, judged))
     usually = max(unseen + chance, math.log(LEAST))
     found: dict[str, Any] = {
         "learn_again": beyond > usually,
@@ -148,10 +148,10 @@ def judge(
         },
         "gain": 1 - math.exp(refitted.mean() - on_new[judged].mean()),
     }
-    return found | {"said": said(found)}
+    return found | {"verdict": verdict(found)}
 
 
-def said(found: Mapping[str, Any]) -> str:
+def verdict(found: Mapping[str, Any]) -> str:
     """The result of `judge` in one line."""
     answer = "yes" if found["learn_again"] else "no"
     return (

@@ -12,7 +12,7 @@ from countersteer.car.car import Car
 from countersteer.car.files import library, load_car, save_car
 from countersteer.car.parameter import EDGE, changed
 from countersteer.errors import InputError
-from countersteer.runs.defects import Fault, faults, refuse, repaired
+from countersteer.runs.defects import LogDefect, find_defects, refuse, repair
 from countersteer.runs.run import Run
 from countersteer.tuning import fit, shooting
 from countersteer.tuning.fit import FLOOR, Fitted, Result
@@ -37,12 +37,12 @@ class Logs(NamedTuple):
 
     def where(self, chosen: np.ndarray) -> "Logs":
         """Some of the windows."""
-        shots = fit.taken(self.shots, chosen)
+        shots = fit.select(self.shots, chosen)
         return self._replace(shots=shots, start=self.start[chosen])
 
-    def charged(self, charge: np.ndarray) -> "Logs":
+    def with_charge(self, charge: np.ndarray) -> "Logs":
         """With it known how full the battery was in each run."""
-        return self._replace(shots=fit.charged(self.shots, charge))
+        return self._replace(shots=fit.with_charge(self.shots, charge))
 
     def joined(self, other: "Logs") -> "Logs":
         """With the windows of other runs after these."""
@@ -63,18 +63,19 @@ def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: 
     clean, masks, words = [], [], []
     for run in runs:
         refuse(run)
-        mended, said = repaired(run)
-        found = faults(mended)
+        mended, repairs = repair(run)
+        found = find_defects(mended)
         clean.append(mended)
         masks.append(found)
-        words += [f"{run.path.name}: {line}" for line in said] + [_said(run, f) for f in found]
+        words += [f"{run.path.name}: {line}" for line in repairs]
+        words += [_defect_line(run, defect) for defect in found]
     surfaces = [surface_of(run, cars, base) for run in clean]
     shots, start = fit.take_shots(clean, dict(cars), surfaces, masks, every)
     return Logs(clean, words, shots, start)
 
 
-def _said(run: Run, fault: Fault) -> str:
-    return f"{run.path.name}: {fault.start:.1f} to {fault.end:.1f} s: {fault.what}"
+def _defect_line(run: Run, defect: LogDefect) -> str:
+    return f"{run.path.name}: {defect.start:.1f} to {defect.end:.1f} s: {defect.what}"
 
 
 def surface_of(run: Run, cars: Mapping[str, Car], base: str) -> str:
@@ -128,10 +129,10 @@ def tune(
     result = fit.fit(cars, thin.shots, what, report)
     # What no log tells is taken from the windows that were fitted; of other logs from their own.
     charge = fit.estimated_charge(result.cars, thin.shots)
-    parts = [(title, part.charged(charge)) for title, part in parts]
+    parts = [(title, part.with_charge(charge)) for title, part in parts]
     if validation is not None:
         charge = fit.estimated_charge(result.cars, validation.shots)
-        parts.append(("validation", validation.charged(charge)))
+        parts.append(("validation", validation.with_charge(charge)))
     runs: list[dict[str, Any]] = []
     totals: dict[str, Any] = {}
     for title, part in parts:
@@ -150,14 +151,14 @@ def tune(
                     "surface": surface,
                     "kind": title,
                     "battery_charge": float(shots.charge[0]),
-                    "battery_told": "battery_charge" in run.about,
+                    "battery_known": "battery_charge" in run.about,
                 }
                 runs.append(entry | judged(result.cars, shots))
     about: dict[str, Any] = {
         "fit": what,
         "seconds": round(time.monotonic() - began, 1),
         "surfaces": list(cars),
-        "parameters": [told(one, logs.runs) for one in result.fitted],
+        "parameters": [parameter_row(one, logs.runs) for one in result.fitted],
         "not_determined": sorted({f.path for f in result.fitted if not f.determined}),
         "at_bounds": sorted({f.path for f in result.fitted if f.at_bound}),
         "runs": runs,
@@ -196,12 +197,12 @@ def judged(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
     whole["persistence"] = found["persistence"]
     whole["transient"] = {"windows": int(lively.sum())}
     if lively.any():
-        some = fit.errors(cars, fit.taken(shots, lively))
+        some = fit.errors(cars, fit.select(shots, lively))
         whole["transient"] |= {"errors": some["simulated"], "persistence": some["persistence"]}
     return whole
 
 
-def told(one: Fitted, runs: Sequence[Run]) -> dict[str, Any]:
+def parameter_row(one: Fitted, runs: Sequence[Run]) -> dict[str, Any]:
     """A fitted parameter in the units of files."""
     declared = fit.declaration(one.path)
     suffix, factor = EDGE[declared.unit]
@@ -289,17 +290,19 @@ def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Pa
     runs = sorted({run["run"] for run in about["runs"] if run["kind"] != "validation"})
     source["logs"] = ", ".join(runs)
     for name, path in files.items():
-        said = source | {
+        about_source = source | {
             kind.replace(" ", "_"): _errors(totals[name])
             for kind, totals in about["totals"].items()
             if name in totals
         }
         if about["not_determined"]:
-            said["not_determined"] = ", ".join(about["not_determined"]) + ": left as they were"
+            about_source["not_determined"] = (
+                ", ".join(about["not_determined"]) + ": left as they were"
+            )
         if name == names[0]:
-            save_car(result.cars[name], path, said)
+            save_car(result.cars[name], path, about_source)
             continue
-        tables: dict[str, Any] = {"base": out.name, "source": said}
+        tables: dict[str, Any] = {"base": out.name, "source": about_source}
         for path_inside in FLOOR:
             *rooms, key = path_inside.split(".")
             suffix, factor = EDGE[fit.declaration(path_inside).unit]
@@ -313,10 +316,10 @@ def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Pa
 
 def _errors(total: dict[str, Any]) -> str:
     """Median errors after a window, as a text."""
-    said = ", ".join(
+    errors = ", ".join(
         f"{quantity} {entry['median_abs_error']:.3f}" for quantity, entry in total["errors"].items()
     )
-    return f"median error after {fit.HORIZON:g} s in {total['windows']} windows: {said}"
+    return f"median error after {fit.HORIZON:g} s in {total['windows']} windows: {errors}"
 
 
 def table_lines(about: dict[str, Any]) -> list[str]:

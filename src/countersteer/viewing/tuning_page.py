@@ -121,7 +121,7 @@ def _headline(result: Mapping[str, Any]) -> str:
             "say little about other logs.</p>"
         ]
     if "new_runs" in result:
-        paragraphs.insert(0, f'<p class="lead">{escape(result["new_runs"]["said"])}</p>')
+        paragraphs.insert(0, f'<p class="lead">{escape(result["new_runs"]["verdict"])}</p>')
     open_, bound = (
         [escape(str(name)) for name in result[key]] for key in ("not_determined", "at_bounds")
     )

@@ -178,9 +178,9 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
 
     held = grip(car, middle, friction)
     before = rotated(velocity, h / 2 * start.yaw_rate)  # in the axes of the tick's middle
-    lean = Wheels(*(w * (1 - state.wary) for w in steady(at_start, held)))
-    after, wheels = two_stages(car, held, lean, before, start.wheels, h)
-    (after, wheels), wary = guarded(car, held, (before, start.wheels), (after, wheels), h)
+    tangent_weight = Wheels(*(w * (1 - state.energy_limited) for w in steady(at_start, held)))
+    after, wheels = two_stages(car, held, tangent_weight, before, start.wheels, h)
+    (after, wheels), energy_limited = guarded(car, held, (before, start.wheels), (after, wheels), h)
 
     end = loaded(car, follow(car, start, goal, h), start, combine(1.0, after, -1.0, before), h)
     turn = h * (start.yaw_rate + after.yaw) / 2
@@ -198,7 +198,7 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
         wheels=wheels,
         charge=battery.drained(car.battery, start.charge, h * held.drive.battery_current),
     )
-    return state._replace(motion=motion, wary=wary), tick
+    return state._replace(motion=motion, energy_limited=energy_limited), tick
 
 
 def guarded(
@@ -228,14 +228,14 @@ def guarded(
 
 
 def two_stages(
-    car: Car, held: "Grip", lean: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
+    car: Car, held: "Grip", tangent_weight: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
 ) -> tuple[Vector, Wheels]:
     """Velocities h seconds later, by Alexander's two implicit stages with the grip held."""
-    first, first_wheels = implicit(car, held, lean, velocity, wheels, GAMMA * h)
+    first, first_wheels = implicit(car, held, tangent_weight, velocity, wheels, GAMMA * h)
     lifted, lifted_wheels = jax.tree.map(
         lambda v, w: v + (1 - GAMMA) / GAMMA * (w - v), (velocity, wheels), (first, first_wheels)
     )
-    return implicit(car, held, lean, lifted, lifted_wheels, GAMMA * h)
+    return implicit(car, held, tangent_weight, lifted, lifted_wheels, GAMMA * h)
 
 
 def steady(start: "Grip", middle: "Grip") -> Wheels:
@@ -329,17 +329,17 @@ def grip(car: Car, motion: Motion, friction: Wheels | None = None) -> Grip:
 
 @jax.jit
 def implicit(
-    car: Car, held: "Grip", lean: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
+    car: Car, held: "Grip", tangent_weight: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
 ) -> tuple[Vector, Wheels]:
     """Velocities h seconds later, by one implicit Euler step with the grip held as it is.
 
     Solves (M + h C) v' = M v + h a, where a - C v are the forces of contacts, drag and drive.
-    A contact's force is taken along its chord where `lean` is 0, along its tangent where it is 1.
+    A contact's force follows its chord where `tangent_weight` is 0, its tangent where it is 1.
     """
     body, tires = car.body, tires_by_wheel(car)
     rolls, slides = contact_directions(car, held.steered)
     along, across, push_x, push_y = [], [], [], []
-    for c, w in zip(held.contacts, lean, strict=True):
+    for c, w in zip(held.contacts, tangent_weight, strict=True):
         along.append(c.k_x + w * (c.tangent_x - c.k_x))
         across.append(c.k_y + w * (c.tangent_y - c.k_y))
         push_x.append(c.push_x + w * (c.tangent_x - c.k_x) * c.slip_x)

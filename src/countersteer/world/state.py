@@ -14,5 +14,5 @@ class State(NamedTuple):
     airborne: Scalar  # time that a pair of wheels has carried nothing, s
     touching: Scalar  # time left in which a touch of a wall counts as the same one, s
     wall_contacts: Scalar  # separate touches so far
-    wary: Scalar  # 1 where the last tick was cut short of gaining energy
+    energy_limited: Scalar  # 1 where the last tick was cut short of gaining energy
     rolled_over: Scalar  # 1 from the moment the car counts as rolled over
