@@ -7,8 +7,11 @@ which the driver hands over; before and after, the closed loop drives.
 """
 
 import dataclasses
+import itertools
 import math
-from typing import Any
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -26,7 +29,7 @@ from countersteer.experiments.found import Found, Report, silent
 from countersteer.link.link import LINKS
 from countersteer.pilot import Pilot
 from countersteer.simulator import Simulator
-from countersteer.task.task import Outcome
+from countersteer.task.task import Outcome, Score
 
 TRIALS = 256
 SPEED = 2.0  # m/s
@@ -63,63 +66,19 @@ def simulate(
     """Eight cells of trials: rate, loop, battery."""
     course = corner()
     closed = drift_turn(course, car, SPEED)
-    open_loop = PlayedTurn(
-        inner=closed,
-        **dict(zip(("throttle", "steering"), record(course, car, closed), strict=True)),
-    )
-    population, seeds = load_population("around"), range(trials)
+    throttle, steering = record(course, car, closed)
+    drivers = {
+        "closed": closed,
+        "open": PlayedTurn(inner=closed, throttle=throttle, steering=steering),
+    }
     rows: dict[str, list[Any]] = {}
-    errors: dict[tuple[str, str, str], np.ndarray] = {}
-    cells = [
-        (link, loop, battery)
-        for link in LINKS
-        for loop in ("open", "closed")
-        for battery in BATTERIES
-    ]
-    for number, (link, loop, battery) in enumerate(cells):
-        charge, wear = BATTERIES[battery]
-        drawn = draw(
-            dataclasses.replace(population, charge=(charge, charge)), car, course, seeds, np.float32
-        )
-        cars = changed(drawn.cars, "battery.wear", np.full(trials, wear, np.float32))
-        driver: Any = closed if loop == "closed" else open_loop
-        pilot = Pilot.of(driver, course, car, link=LINKS[link])
-        score, _ = run_trials(
-            course,
-            pilot,
-            drawn._replace(cars=cars),
-            [driver] * trials,
-            seeds,
-            1,
-            LONGEST,
-            lanes=lanes,
-            link=LINKS[link],
-        )
-        won = score.outcome == Outcome.REACHED.code
+    errors: dict[Cell, np.ndarray] = {}
+    cells = [Cell(*one) for one in itertools.product(LINKS, ("open", "closed"), BATTERIES)]
+    for number, cell in enumerate(cells):
+        score = run_cell(course, car, drivers[cell.loop], cell, trials, lanes)
         ended = np.isfinite(score.turns.end[:, 0])
-        error = np.degrees(score.turns.error[ended, 0])
-        errors[link, loop, battery] = error
-        low, high = interval(int(won.sum()), trials)
-        for key, value in {
-            "control_hz": 1 / LINKS[link].control_period,
-            "link": link,
-            "loop": loop,
-            "battery": battery,
-            "battery_charge": charge,
-            "battery_wear": wear,
-            "trials": trials,
-            "success_rate": float(won.mean()),
-            "success_low": low,
-            "success_high": high,
-            "turns_ended": int(ended.sum()),
-            "heading_error_mean_deg": float(error.mean()) if len(error) else math.nan,
-            "heading_error_rms_deg": float(np.sqrt(np.mean(error**2))) if len(error) else math.nan,
-            "peak_sideslip_median_deg": float(
-                np.degrees(np.median(score.turns.peak_sideslip[ended, 0]))
-            )
-            if len(error)
-            else math.nan,
-        }.items():
+        errors[cell] = np.degrees(score.turns.error[ended, 0])
+        for key, value in row(cell, score).items():
             rows.setdefault(key, []).append(value)
         report(number + 1, len(cells))
     figures = {
@@ -127,39 +86,106 @@ def simulate(
         "speed_mps": SPEED,
         "cells": [dict(zip(rows, cell, strict=True)) for cell in zip(*rows.values(), strict=True)],
     }
+    text = _text(name, trials, rows, cells)
+    return Found(rows, figures, text, partial(_paint, name, trials, rows, errors), (11.0, 4.6))
+
+
+class Cell(NamedTuple):
+    """One set of trials."""
+
+    link: str
+    loop: str  # open or closed
+    battery: str  # first or last
+
+
+def run_cell(course: Course, car: Car, driver: Any, cell: Cell, trials: int, lanes: int) -> Score:
+    """Its trials."""
+    charge, wear = BATTERIES[cell.battery]
+    population = dataclasses.replace(load_population("around"), charge=(charge, charge))
+    drawn = draw(population, car, course, range(trials), np.float32)
+    cars = changed(drawn.cars, "battery.wear", np.full(trials, wear, np.float32))
+    link = LINKS[cell.link]
+    return run_trials(
+        course,
+        Pilot.of(driver, course, car, link=link),
+        drawn._replace(cars=cars),
+        [driver] * trials,
+        range(trials),
+        1,
+        LONGEST,
+        lanes=lanes,
+        link=link,
+    )[0]
+
+
+def row(cell: Cell, score: Score) -> dict[str, Any]:
+    """What came of a cell, as a row of the table."""
+    won = score.outcome == Outcome.REACHED.code
+    ended = np.isfinite(score.turns.end[:, 0])
+    error = np.degrees(score.turns.error[ended, 0])
+    low, high = interval(int(won.sum()), len(won))
+    charge, wear = BATTERIES[cell.battery]
+    mean = rms = slip = math.nan
+    if len(error):
+        mean, rms = float(error.mean()), float(np.sqrt(np.mean(error**2)))
+        slip = float(np.degrees(np.median(score.turns.peak_sideslip[ended, 0])))
+    return {
+        "control_hz": 1 / LINKS[cell.link].control_period,
+        **cell._asdict(),
+        "battery_charge": charge,
+        "battery_wear": wear,
+        "trials": len(won),
+        "success_rate": float(won.mean()),
+        "success_low": low,
+        "success_high": high,
+        "turns_ended": int(ended.sum()),
+        "heading_error_mean_deg": mean,
+        "heading_error_rms_deg": rms,
+        "peak_sideslip_median_deg": slip,
+    }
+
+
+def _text(name: str, trials: int, rows: dict[str, list[Any]], cells: Sequence[Cell]) -> str:
+    """The figures in words."""
 
     def cell(link: str, loop: str, battery: str) -> str:
-        i = cells.index((link, loop, battery))
+        i = cells.index(Cell(link, loop, battery))
         rate, error = rows["success_rate"][i], rows["heading_error_rms_deg"][i]
         return f"{100 * rate:.0f} % pass ({error:.0f}° rms of heading)"
 
     def pair(link: str, loop: str) -> str:
         return f"{cell(link, loop, 'first')} with the first, {cell(link, loop, 'last')} the last"
 
-    text = (
+    return (
         f"A 90° corner, 1.4 m wide, at {SPEED:g} m/s, {trials} cars drawn around {name}, with the "
         f"first battery (full, new) and the last (30 %, worn). On board at 1000 Hz, closed loop: "
         f"{pair('onboard', 'closed')}; open loop: {pair('onboard', 'open')}. Over the radio at "
         f"10 Hz, closed loop: {pair('radio', 'closed')}; open loop: {pair('radio', 'open')}."
     )
 
-    def paint(figure: Any) -> None:
-        left, right = figure.subplots(1, 2)
-        rates = {"onboard": "1000 Hz on board", "radio": "10 Hz by radio"}
-        labels = [f"{rates[link]}\n{loop} loop, {battery} battery" for link, loop, battery in cells]
-        colours = ["tab:blue" if loop == "closed" else "tab:orange" for _, loop, _ in cells]
-        place = np.arange(len(cells))[::-1]
-        rate = np.array(rows["success_rate"])
-        ends = np.abs(np.array([rows["success_low"], rows["success_high"]]) - rate)
-        left.barh(place, 100 * rate, xerr=100 * ends, color=colours, height=0.7)
-        left.set_yticks(place, labels, fontsize=8)
-        left.set_xlabel("corners passed, % (95 % interval)")
-        left.set_xlim(0, 100)
-        shown = [errors[one] if len(errors[one]) else np.array([math.nan]) for one in cells]
-        right.boxplot(shown, positions=place, orientation="horizontal", widths=0.6, sym=".")
-        right.set_yticks(place, [""] * len(cells))
-        right.axvline(0, color="grey", linewidth=0.8)
-        right.set_xlabel("heading error of turns that ended, °")
-        figure.suptitle(f"control-rate: {name}, {trials} trials each")
 
-    return Found(rows, figures, text, paint, (11.0, 4.6))
+def _paint(
+    name: str,
+    trials: int,
+    rows: dict[str, list[Any]],
+    errors: dict[Cell, np.ndarray],
+    figure: Any,
+) -> None:
+    """Corners passed, and heading errors, by cell."""
+    left, right = figure.subplots(1, 2)
+    rates = {"onboard": "1000 Hz on board", "radio": "10 Hz by radio"}
+    labels = [f"{rates[c.link]}\n{c.loop} loop, {c.battery} battery" for c in errors]
+    colours = ["tab:blue" if c.loop == "closed" else "tab:orange" for c in errors]
+    place = np.arange(len(errors))[::-1]
+    rate = np.array(rows["success_rate"])
+    ends = np.abs(np.array([rows["success_low"], rows["success_high"]]) - rate)
+    left.barh(place, 100 * rate, xerr=100 * ends, color=colours, height=0.7)
+    left.set_yticks(place, labels, fontsize=8)
+    left.set_xlabel("corners passed, % (95 % interval)")
+    left.set_xlim(0, 100)
+    shown = [error if len(error) else np.array([math.nan]) for error in errors.values()]
+    right.boxplot(shown, positions=place, orientation="horizontal", widths=0.6, sym=".")
+    right.set_yticks(place, [""] * len(errors))
+    right.axvline(0, color="grey", linewidth=0.8)
+    right.set_xlabel("heading error of turns that ended, °")
+    figure.suptitle(f"control-rate: {name}, {trials} trials each")

@@ -12,6 +12,7 @@ of over 25°.
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,8 @@ from countersteer.experiments.found import Found, Report, silent
 DRAWS = 512
 GATE = 1.2  # m before and behind the corner
 WIDEST, RESOLUTION = 2.0, 0.01  # m
+WIDTHS = (0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.4)  # m, at which times are compared
+WAYS = {False: "grip", True: "drift"}  # by whether the car slides
 LINED_UP = math.radians(30)
 GRIP_SLIP = math.radians(12)
 LONGEST = 4.5  # s
@@ -124,42 +127,18 @@ def simulate(
     car: Car, name: str, report: Report = silent, draws: int = DRAWS, lanes: int = LANES
 ) -> Found:
     """Bisection for the narrowest width of either law, and times over a range of widths."""
-    low, high = float(car.body.width), WIDEST
-    halvings = math.ceil(math.log2((high - low) / RESOLUTION))
-    widths = (0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.4)
-    steps, done = 2 * (halvings + len(widths) + 1), 0
-    tried: dict[tuple[bool, float], Tried] = {}
-
-    def passes(slides: bool, width: float) -> bool:
-        nonlocal done
-        tried[slides, width] = attempt(car, width, slides, draws, lanes)
-        done += 1
-        report(done, steps)
-        return bool(np.any(np.isfinite(tried[slides, width].time)))
-
-    narrowest: dict[bool, float] = {}
-    for slides in (False, True):
-        narrowest[slides] = math.nan
-        for width in widths:
-            passes(slides, width)
-        if passes(slides, high):
-            bottom, top = low, high
-            while top - bottom > RESOLUTION:
-                middle = (top + bottom) / 2
-                if passes(slides, middle):
-                    top = middle
-                else:
-                    bottom = middle
-            narrowest[slides] = top
+    tried, narrowest = search(car, report, draws, lanes)
     order = sorted(tried)
     best = {key: _best(tried[key]) for key in order}
     # What gets through a narrow corridor gets through a wider one with the same middle.
     fastest = {
-        (s, w): np.nanmin([best[key][0] for key in order if key[0] == s and key[1] <= w] + [np.inf])
+        (s, w): float(
+            np.nanmin([best[key][0] for key in order if key[0] == s and key[1] <= w] + [np.inf])
+        )
         for s, w in order
     }
     table: dict[str, list[Any]] = {
-        "way": ["drift" if slides else "grip" for slides, _ in order],
+        "way": [WAYS[slides] for slides, _ in order],
         "width_m": [width for _, width in order],
         "draws": [draws] * len(order),
         "passed": [int(np.isfinite(tried[key].time).sum()) for key in order],
@@ -170,26 +149,72 @@ def simulate(
         "entry_speed_mps": [best[key][1] for key in order],
         "peak_sideslip_deg": [best[key][2] for key in order],
     }
-    found = {}
-    for slides, way in ((False, "grip"), (True, "drift")):
+    found: dict[str, dict[str, Any]] = {}
+    for slides, way in WAYS.items():
         width = narrowest[slides]
-        known = not math.isnan(width)
-        there = best[slides, width] if known else (math.nan,) * 3
-        found[way] = {
-            "narrowest_m": width if known else None,
-            "time_s": there[0] if known else None,
-            "entry_speed_mps": there[1] if known else None,
-            "peak_sideslip_deg": there[2] if known else None,
-        }
-    figures = {
+        figures = (None,) * 4 if math.isnan(width) else (width, *best[slides, width])
+        names = ("narrowest_m", "time_s", "entry_speed_mps", "peak_sideslip_deg")
+        found[way] = dict(zip(names, figures, strict=True))
+    figures_of_all = {
         "car": name,
         "draws": draws,
         "resolution_m": RESOLUTION,
         "gates_m": 2 * GATE,
         **found,
     }
+    tracks = {
+        slides: np.zeros((3, 0)) if math.isnan(width) else tried[slides, width].track
+        for slides, width in narrowest.items()
+    }
+    return Found(
+        table,
+        figures_of_all,
+        _text(name, draws, found, fastest),
+        partial(_paint, name, car, fastest, narrowest, tracks),
+        (12.0, 4.2),
+    )
 
-    def say(way: str) -> str:
+
+def search(
+    car: Car, report: Report, draws: int, lanes: int
+) -> tuple[dict[tuple[bool, float], Tried], dict[bool, float]]:
+    """What came of each width that was tried, and the narrowest passed (NaN: none), by way."""
+    low, high = float(car.body.width), WIDEST
+    halvings = math.ceil(math.log2((high - low) / RESOLUTION))
+    steps = 2 * (halvings + len(WIDTHS) + 1)
+    tried: dict[tuple[bool, float], Tried] = {}
+
+    def passes(slides: bool, width: float) -> bool:
+        tried[slides, width] = attempt(car, width, slides, draws, lanes)
+        report(len(tried), steps)
+        return bool(np.any(np.isfinite(tried[slides, width].time)))
+
+    narrowest: dict[bool, float] = {}
+    for slides in WAYS:
+        narrowest[slides] = math.nan
+        for width in WIDTHS:
+            passes(slides, width)
+        if passes(slides, high):
+            bottom, top = low, high
+            while top - bottom > RESOLUTION:
+                middle = (top + bottom) / 2
+                if passes(slides, middle):
+                    top = middle
+                else:
+                    bottom = middle
+            narrowest[slides] = top
+    return tried, narrowest
+
+
+def _text(
+    name: str,
+    draws: int,
+    found: dict[str, dict[str, Any]],
+    fastest: dict[tuple[bool, float], float],
+) -> str:
+    """The figures in words."""
+
+    def narrowest(way: str) -> str:
         one = found[way]
         if one["narrowest_m"] is None:
             return f"by {way} none of up to {WIDEST:g} m"
@@ -198,40 +223,44 @@ def simulate(
             f"{one['entry_speed_mps']:.2f} m/s"
         )
 
-    said = []
-    for width in widths:
-        times = [fastest[slides, width] for slides in (False, True)]
-        words = [f"{t:.2f} s" if math.isfinite(t) else "not passed" for t in times]
-        said.append(f"{width:g} m {words[0]} and {words[1]}")
-    text = (
+    times = []
+    for width in WIDTHS:
+        both = [fastest[slides, width] for slides in WAYS]
+        words = [f"{t:.2f} s" if math.isfinite(t) else "not passed" for t in both]
+        times.append(f"{width:g} m {words[0]} and {words[1]}")
+    return (
         f"The narrowest 90° corner that {name} passes, of {draws} draws of each law: "
-        f"{say('grip')}; {say('drift')}. Fastest from 1.2 m before the corner to 1.2 m behind "
-        f"it, by grip and by drift, over width: {'; '.join(said)}."
+        f"{narrowest('grip')}; {narrowest('drift')}. Fastest from 1.2 m before the corner to 1.2 m "
+        f"behind it, by grip and by drift, over width: {'; '.join(times)}."
     )
 
-    def paint(figure: Any) -> None:
-        left, *maps = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
-        for slides, way, colour in ((False, "grip", "tab:blue"), (True, "drift", "tab:red")):
-            mine = [
-                (w, fastest[s, w]) for s, w in order if s == slides and np.isfinite(fastest[s, w])
-            ] or [(math.nan, math.nan)]
-            left.plot(*zip(*mine, strict=True), ".-", color=colour, label=way)
-            if not math.isnan(narrowest[slides]):
-                left.axvline(narrowest[slides], color=colour, linewidth=0.8, linestyle=":")
-        left.set_xlabel("width of the corridor, m")
-        left.set_ylabel("best time between the gates, s")
-        left.set_ylim(bottom=0)
-        left.legend(frameon=False)
-        for ax, slides, way in zip(maps, (False, True), ("grip", "drift"), strict=True):
-            width = narrowest[slides]
-            ax.set_aspect("equal")
-            ax.set_title(f"by {way}: " + ("none" if math.isnan(width) else f"{width:.2f} m"))
-            if math.isnan(width):
-                continue
-            _draw_track(ax, car, width, tried[slides, width].track)
-        figure.suptitle(f"narrowest-corner: {name}")
 
-    return Found(table, figures, text, paint, (12.0, 4.2))
+def _paint(
+    name: str,
+    car: Car,
+    fastest: dict[tuple[bool, float], float],
+    narrowest: dict[bool, float],
+    tracks: dict[bool, np.ndarray],
+    figure: Any,
+) -> None:
+    """Times over width, and both ways through their narrowest corner."""
+    left, *maps = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
+    for ax, (slides, way), colour in zip(maps, WAYS.items(), ("tab:blue", "tab:red"), strict=True):
+        mine = [(w, t) for (s, w), t in fastest.items() if s == slides and math.isfinite(t)]
+        width = narrowest[slides]
+        left.plot(
+            *zip(*(mine or [(math.nan, math.nan)]), strict=True), ".-", color=colour, label=way
+        )
+        ax.set_aspect("equal")
+        ax.set_title(f"by {way}: " + ("none" if math.isnan(width) else f"{width:.2f} m"))
+        if not math.isnan(width):
+            left.axvline(width, color=colour, linewidth=0.8, linestyle=":")
+            _draw_track(ax, car, width, tracks[slides])
+    left.set_xlabel("width of the corridor, m")
+    left.set_ylabel("best time between the gates, s")
+    left.set_ylim(bottom=0)
+    left.legend(frameon=False)
+    figure.suptitle(f"narrowest-corner: {name}")
 
 
 def _best(tried: Tried) -> tuple[float, float, float]:

@@ -146,6 +146,34 @@ def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None
     return SensorMemory(readings, zero, zero, zero, velocity, eye, poses)
 
 
+class Now(NamedTuple):
+    """What a sensor's report is made from."""
+
+    car: Car
+    walls: jax.Array
+    corners: jax.Array
+    memory: SensorMemory
+    motion: Motion
+    shaft: Scalar  # speed of the driven shaft, seen from the wheels (rad/s)
+    root: jax.Array
+    tick: Scalar
+    dt: float
+
+    def noise(self, stream: Stream, shape: tuple[int, ...] = ()) -> jax.Array:
+        """Standard normal noise of a sensor at this tick."""
+        key = streams.key(self.root, stream, tick=self.tick)
+        return jax.random.normal(key, shape, jnp.result_type(self.motion.x))
+
+    @property
+    def pose(self) -> tuple[Scalar, Scalar, Scalar]:
+        """x, y (m), heading (rad)."""
+        return self.motion.x, self.motion.y, self.motion.heading
+
+    def since(self, last: Reading) -> Scalar:
+        """Time since a reading (s)."""
+        return (self.tick - jnp.maximum(last.tick, 0)) * self.dt
+
+
 def sense(
     car: Car,
     walls: jax.Array,
@@ -158,108 +186,35 @@ def sense(
     dt: float,
 ) -> SensorMemory:
     """The sensors after a tick. Noise is drawn once a reading, from the drive's key `root`."""
-    sensors, readings = car.sensors, memory.readings
+    sensors = car.sensors
     shaft = drivetrain.driven_speed(car, motion.wheels)
     speed = parts.disc_speed(sensors.encoder, motion.wheels, shaft)
     turned = memory.disc + dt * parts.regions_per_second(sensors.encoder, speed)
     passed = jnp.floor(turned)
     memory = memory._replace(disc=turned - passed, counts=memory.counts + jnp.abs(passed))
-    own = partial(streams.key, root, tick=tick)
-    dtype = jnp.result_type(motion.x)
-
-    def ping(readings: Readings) -> Readings:
-        mounts = len(sensors.sonar.mounts)
-        if sensors.sonar.firing == "in-turn":
-            turn = number(every.sonar, tick) % mounts
-            fires = tuple(jnp.where(turn == i, 1.0, 0.0) for i in range(mounts))
-        else:
-            fires = (jnp.asarray(1.0),) * mounts
-        pose = (motion.x, motion.y, motion.heading)
-        found = sonar.distances(sensors.sonar, walls, corners, pose, fires, own(Stream.SONAR))
-        return readings._replace(
-            sonar=tuple(
-                Reading(
-                    jnp.where(f > 0, d, old.value).astype(dtype), jnp.where(f > 0, tick, old.tick)
-                )
-                for f, d, old in zip(fires, found, readings.sonar, strict=True)
-            )
-        )
-
-    def turn(readings: Readings) -> Readings:
-        noise = jax.random.normal(own(Stream.GYROSCOPE), dtype=dtype)
-        return readings._replace(
-            gyroscope=Reading(parts.gyroscope(sensors.gyroscope, motion.yaw_rate, noise), tick)
-        )
-
-    def weigh(readings: Readings) -> Readings:
-        noise = jax.random.normal(own(Stream.ACCELEROMETER), (2,), dtype=dtype)
-        time = (tick - jnp.maximum(readings.accel_x.tick, 0)) * dt
-        # The mean since the last report, of the turning too: else a turn that begins is felt early.
-        before = memory.velocity
-        ax = (motion.vx - before.x) / time - (
-            before.yaw * before.y + motion.yaw_rate * motion.vy
-        ) / 2
-        ay = (motion.vy - before.y) / time + (
-            before.yaw * before.x + motion.yaw_rate * motion.vx
-        ) / 2
-        x, y = parts.accelerometer(sensors.accelerometer, ax, ay, noise)
-        return readings._replace(accel_x=Reading(x, tick), accel_y=Reading(y, tick))
-
-    def count(readings: Readings) -> Readings:
-        radius = car.tires.rear.radius if "rear" in sensors.encoder.on else car.tires.front.radius
-        time = (tick - jnp.maximum(readings.wheel_speed.tick, 0)) * dt
-        speed = parts.wheel_speed(
-            sensors.encoder, radius, memory.counts - memory.counts_before, time
-        )
-        return readings._replace(
-            counts=Reading(memory.counts, tick), wheel_speed=Reading(speed, tick)
-        )
-
-    def probe(readings: Readings) -> Readings:
-        noise = jax.random.normal(own(Stream.VOLTMETER), dtype=dtype)
-        voltage = motor.drive(
-            car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, shaft
-        ).battery_voltage
-        return readings._replace(
-            battery=Reading(parts.voltmeter(sensors.voltmeter, voltage, noise), tick)
-        )
-
-    def scan(readings: Readings) -> Readings:
-        pose = (motion.x, motion.y, motion.heading)
-        noise = jax.random.normal(own(Stream.LIDAR), (sensors.lidar.beams,), dtype)
-        return readings._replace(
-            lidar=Reading(lidar.ranges(sensors.lidar, walls, pose, noise), tick)
-        )
-
-    def locate(readings: Readings) -> Readings:
-        noise = jax.random.normal(own(Stream.POSITION), (3,), dtype)
-        assert memory.poses is not None
-        told = parts.position(sensors.position, memory.poses[(tick + 1) % len(memory.poses)], noise)
-        new: dict[str, Any] = {
-            name: Reading(value, tick)
-            for name, value in zip(POSITION, told, strict=True)
-            if getattr(readings, name) is not None
-        }
-        return readings._replace(**new)
+    slots = 0 if memory.poses is None else len(memory.poses)
+    if memory.poses is not None:
+        pose = jnp.stack([motion.x, motion.y, motion.heading])
+        memory = memory._replace(poses=memory.poses.at[tick % slots].set(pose))
 
     counted, weighed = due(every.encoder, tick), due(every.accelerometer, tick)
     reports = [
-        (due(every.gyroscope, tick), turn),
-        (weighed, weigh),
-        (counted, count),
-        (due(every.voltmeter, tick), probe),
+        (due(every.gyroscope, tick), report_gyroscope),
+        (weighed, report_accelerometer),
+        (counted, report_encoder),
+        (due(every.voltmeter, tick), report_voltmeter),
     ]
     if sensors.sonar.mounts:
-        reports.append((due(every.sonar, tick), ping))
+        turn = number(every.sonar, tick) % len(sensors.sonar.mounts)
+        reports.append((due(every.sonar, tick), partial(report_sonar, turn)))
     if every.lidar is not None:
-        reports.append((due(every.lidar, tick), scan))
+        reports.append((due(every.lidar, tick), report_lidar))
     if every.position is not None and memory.poses is not None:
-        slots = len(memory.poses)
-        pose = jnp.stack([motion.x, motion.y, motion.heading])
-        memory = memory._replace(poses=memory.poses.at[tick % slots].set(pose))
-        reports.append((due(every.position, tick) & (tick >= slots - 1), locate))
-    for now, report in reports:
-        readings = jax.lax.cond(now, report, lambda same: same, readings)
+        reports.append((due(every.position, tick) & (tick >= slots - 1), report_position))
+    now = Now(car, walls, corners, memory, motion, shaft, root, tick, dt)
+    readings = memory.readings
+    for is_due, report in reports:
+        readings = jax.lax.cond(is_due, partial(report, now), lambda same: same, readings)
     if memory.eye is not None:
         eye = parts.eye(sensors.line_detector, motion.x, motion.heading)
         readings = cross(car, readings, memory.eye, eye, tick, dt)
@@ -270,6 +225,89 @@ def sense(
         counts_before=jnp.where(counted, memory.counts, memory.counts_before),
         velocity=jax.tree.map(partial(jnp.where, weighed), moves, memory.velocity),
     )
+
+
+def report_sonar(turn: Scalar, now: Now, readings: Readings) -> Readings:
+    """A ping of all mounts, or of the one whose `turn` it is."""
+    part, dtype = now.car.sensors.sonar, jnp.result_type(now.motion.x)
+    fires: tuple[jax.Array, ...] = (jnp.asarray(1.0),) * len(part.mounts)
+    if part.firing == "in-turn":
+        fires = tuple(jnp.where(turn == i, 1.0, 0.0) for i in range(len(part.mounts)))
+    key = streams.key(now.root, Stream.SONAR, tick=now.tick)
+    found = sonar.distances(part, now.walls, now.corners, now.pose, fires, key)
+    return readings._replace(
+        sonar=tuple(
+            Reading(
+                jnp.where(f > 0, d, old.value).astype(dtype), jnp.where(f > 0, now.tick, old.tick)
+            )
+            for f, d, old in zip(fires, found, readings.sonar, strict=True)
+        )
+    )
+
+
+def report_gyroscope(now: Now, readings: Readings) -> Readings:
+    """The yaw rate."""
+    part, noise = now.car.sensors.gyroscope, now.noise(Stream.GYROSCOPE)
+    rate = parts.gyroscope(part, now.motion.yaw_rate, noise)
+    return readings._replace(gyroscope=Reading(rate, now.tick))
+
+
+def report_accelerometer(now: Now, readings: Readings) -> Readings:
+    """The mean acceleration since the last report, turning included.
+
+    Of the turning too: otherwise a turn that begins would be felt early.
+    """
+    before, motion, time = now.memory.velocity, now.motion, now.since(readings.accel_x)
+    ax = (motion.vx - before.x) / time - (before.yaw * before.y + motion.yaw_rate * motion.vy) / 2
+    ay = (motion.vy - before.y) / time + (before.yaw * before.x + motion.yaw_rate * motion.vx) / 2
+    noise = now.noise(Stream.ACCELEROMETER, (2,))
+    x, y = parts.accelerometer(now.car.sensors.accelerometer, ax, ay, noise)
+    return readings._replace(accel_x=Reading(x, now.tick), accel_y=Reading(y, now.tick))
+
+
+def report_encoder(now: Now, readings: Readings) -> Readings:
+    """Counts, and the wheel speed that the counts since the last report make."""
+    part, tires, memory = now.car.sensors.encoder, now.car.tires, now.memory
+    radius = tires.rear.radius if "rear" in part.on else tires.front.radius
+    time = now.since(readings.wheel_speed)
+    speed = parts.wheel_speed(part, radius, memory.counts - memory.counts_before, time)
+    return readings._replace(
+        counts=Reading(memory.counts, now.tick), wheel_speed=Reading(speed, now.tick)
+    )
+
+
+def report_voltmeter(now: Now, readings: Readings) -> Readings:
+    """The battery's voltage under load."""
+    car, motion = now.car, now.motion
+    noise = now.noise(Stream.VOLTMETER)
+    voltage = motor.drive(
+        car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, now.shaft
+    ).battery_voltage
+    volts = parts.voltmeter(car.sensors.voltmeter, voltage, noise)
+    return readings._replace(battery=Reading(volts, now.tick))
+
+
+def report_lidar(now: Now, readings: Readings) -> Readings:
+    """A scan."""
+    part = now.car.sensors.lidar
+    noise = now.noise(Stream.LIDAR, (part.beams,))
+    return readings._replace(
+        lidar=Reading(lidar.ranges(part, now.walls, now.pose, noise), now.tick)
+    )
+
+
+def report_position(now: Now, readings: Readings) -> Readings:
+    """The pose of `delay` ago."""
+    poses = now.memory.poses
+    assert poses is not None
+    noise = now.noise(Stream.POSITION, (3,))
+    then = parts.position(now.car.sensors.position, poses[(now.tick + 1) % len(poses)], noise)
+    new: dict[str, Any] = {
+        name: Reading(value, now.tick)
+        for name, value in zip(POSITION, then, strict=True)
+        if getattr(readings, name) is not None
+    }
+    return readings._replace(**new)
 
 
 def cross(
