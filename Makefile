@@ -39,6 +39,8 @@ notebook: $(READY)
 	$(BIN)/python -c "import sys, nbclient, nbformat; name = sys.argv[1]; \
 		book = nbformat.read(name, 4); \
 		nbclient.NotebookClient(book, record_timing=False).execute(); \
+		[cell.update(outputs=[o for o in cell.outputs if o.get('name') != 'stderr']) \
+		for cell in book.cells if cell.cell_type == 'code']; \
 		nbformat.write(book, name)" examples/drift.ipynb
 	$(BIN)/ruff format examples/drift.ipynb
 

@@ -12,9 +12,11 @@ NOTEBOOK = Path(__file__).parents[1] / "examples" / "drift.ipynb"
 LARGEST = 300_000  # bytes, outputs included
 
 CHECKS = """
-assert len(motion.x) == 6500
-assert record.status.turn[-1] == 3 and record.wall_contacts[-1] == 0
-assert 25 < np.degrees(np.abs(sideslip).max()) < 60
+assert run.success and len(run.turns) == 4 and len(x) > 500
+assert 25 < np.abs(sideslip).max() < 60
+# Stepped by hand it is the same drive, of which the driver knows what it needs.
+there = np.interp(times, run.columns["time_s"], np.degrees(np.arctan2(vy, np.maximum(vx, 0.3))))
+assert np.abs(there - true).max() < 0.6 and rms < 2
 # The less the rear tyres hold, the wilder the drift; with rubber there is none.
 assert np.all(np.diff(slips[2:9]) < 0) and slips[2] > 45 and np.all(slips[8:] < 12)
 assert len(plt.get_fignums()) == 3
@@ -35,7 +37,7 @@ def test_the_notebook_runs_as_it_stands(cells, tmp_path):
         env={**os.environ, "MPLBACKEND": "agg"},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=400,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     outputs = [output for cell in cells for output in cell.get("outputs", [])]
@@ -44,7 +46,7 @@ def test_the_notebook_runs_as_it_stands(cells, tmp_path):
 
 
 def test_the_outputs_are_of_one_run_from_top_to_bottom(cells):
-    assert len(cells) == 10
+    assert len(cells) == 12
     assert NOTEBOOK.stat().st_size < LARGEST
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))

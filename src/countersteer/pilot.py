@@ -25,6 +25,7 @@ from countersteer.drivers.driver import Driver, Heard, Observation, Status, stat
 from countersteer.drivers.library import driver_of_tables
 from countersteer.drivers.plan import Read
 from countersteer.errors import InputError
+from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.estimator import Estimator
 from countersteer.estimation.library import ESTIMATORS
 from countersteer.link.link import LINKS, ONBOARD, Link
@@ -178,6 +179,14 @@ class Pilot:
         ages: Any = jax.tree.map(heard, told[:-1], is_leaf=lambda node: isinstance(node, Reading))
         return estimate, Observation(*(self.dt * tick.astype(dtype), *ages, known))
 
+    def estimate(self, memory: PilotMemory) -> Estimate:
+        """What the estimator believes since its last update. Called from Python it is compiled."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(memory.estimate)):
+            return self.estimator.estimate(memory.estimate)
+        with jax.enable_x64(self.dtype == np.float64):
+            found = _compiled_estimate(self.estimator, memory.estimate)
+            return jax.tree.map(np.asarray, found)
+
     def status(self, memory: PilotMemory) -> Status:
         """What the driver says it is about."""
         return status_of(self.driver, memory.driver)
@@ -208,6 +217,7 @@ def _act(
 
 _compiled_init, _compiled_act = jax.jit(_init), jax.jit(_act)
 _compiled_observe = jax.jit(Pilot.observe)
+_compiled_estimate = jax.jit(lambda estimator, memory: estimator.estimate(memory))
 
 
 @jax.jit
