@@ -54,7 +54,7 @@ def imported(tmp_path_factory):
 def test_a_recording_becomes_a_run(imported):
     run = imported(DRIFT)
     assert run.path.name == Path(DRIFT).stem
-    assert run.about["format"] == "dart"
+    assert run.about["log_format"] == "dart"
     assert run.about["full_lock_deg"] == 25
     assert list(run.truth) == ["time_s", "x_m", "y_m", "heading_rad"]
     assert list(run.telemetry) == [

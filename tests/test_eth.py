@@ -124,7 +124,7 @@ def test_the_command_line_imports_it(tmp_path, capsys):
     )
     assert status == 0
     assert (tmp_path / "runs" / "log" / "truth.csv").exists()
-    assert '"format": "eth"' in capsys.readouterr().out
+    assert '"log_format": "eth"' in capsys.readouterr().out
 
 
 def test_the_library_s_car_has_the_published_numbers():

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -17,8 +18,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import countersteer
 from conftest import driven, write_run
 from countersteer import cli
+from countersteer.batch.population import load_population
 from countersteer.car.files import library, load_car, parameters, save_car
 from countersteer.completion import every_action, script
 from countersteer.course.course import grip_speed, place, progress
@@ -26,6 +29,8 @@ from countersteer.course.files import library as courses
 from countersteer.course.files import load_course
 from countersteer.drivers import DRIVERS
 from countersteer.drivers.drift_turn import drift_turn
+from countersteer.drivers.policy import library as library_policy
+from countersteer.drivers.policy import load_policy, save_policy
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
@@ -34,7 +39,7 @@ from countersteer.runs.files import column_rows, command_rows, read_commands, re
 from countersteer.runs.recorder import Pace, Recorder, new_folder
 from countersteer.runs.run import read_run
 from countersteer.sensing.suite import channels
-from countersteer.text import read_text
+from countersteer.text import read_text, tables_of
 from countersteer.viewing.picture import draw_picture
 from countersteer.viewing.report import report_html
 from countersteer.viewing.view import view_of
@@ -564,3 +569,39 @@ def test_a_run_that_was_killed_still_has_a_page_and_a_picture(tmp_path):
     assert "not judged" in report_html(view)
     draw_picture(view, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("kind", "read"),
+    [
+        ("car", load_car),
+        ("course", load_course),
+        ("set", load_population),
+        ("policy", load_policy),
+    ],
+)
+def test_a_file_of_a_later_format_is_refused_in_one_line(tmp_path, kind, read):
+    file = tmp_path / f"{kind}.toml"
+    file.write_text("format = 2\n")
+    with pytest.raises(InputError, match="format 2 is later than 1.*install a newer one") as error:
+        read(str(file))
+    assert str(file) in str(error.value)
+    for value in ("0", "true", '"1"', "1.5"):
+        file.write_text(f"format = {value}\n")
+        with pytest.raises(InputError, match="format must be a whole number from 1 on"):
+            read(str(file))
+
+
+def test_every_toml_that_comes_with_the_package_or_that_it_writes_has_a_format(tmp_path):
+    package = Path(countersteer.__file__).parent
+    files = list(package.rglob("library/*.toml"))
+    save_car(load_car("rx7"), tmp_path / "car.toml", {"all": "a test"})
+    save_policy(tmp_path / "policy.toml", {"all": "a test"}, library_policy().turning)
+    (tmp_path / "run").mkdir()
+    headers = {"commands": tuple(COMMANDS.strip().split(","))}
+    with Recorder(tmp_path / "run", {"title": "a run"}, headers):
+        files += [*tmp_path.glob("*.toml"), tmp_path / "run" / "run.toml"]
+    assert len(files) > 12
+    for file in files:
+        assert tomllib.loads(file.read_text())["format"] == 1, file
+        assert "format" not in tables_of(file.read_text(), str(file))

@@ -7,7 +7,8 @@ from typing import Any
 
 def cars() -> list[dict[str, Any]]:
     """The cars of the library."""
-    from countersteer.car.files import LIBRARY, library, load_car, read_toml
+    from countersteer.car.files import LIBRARY, library, load_car
+    from countersteer.text import read_toml
 
     found = []
     for name in library():

@@ -1,10 +1,17 @@
-"""Text files that a person hands in."""
+"""Text files that a person hands in, and the TOML files of the project."""
 
+import tomllib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import tomli_w
 
 from countersteer.errors import InputError
 
 MOST = 256  # MB; an hour of commands at 1 kHz is 150
+LARGEST_TOML = 10  # MB of a file that a person writes
+FORMAT = 1  # of the files that this version writes, and the latest that it reads
 
 
 def read_text(path: Path, most: float = MOST) -> str:
@@ -24,3 +31,41 @@ def read_text(path: Path, most: float = MOST) -> str:
         return content.decode()
     except UnicodeDecodeError:
         raise InputError(f"{path}: cannot be read: it is not text") from None
+
+
+def read_toml(name: str, shelf: Any, kind: str, files: str = ".toml") -> tuple[dict[str, Any], str]:
+    """The tables of a library entry or of a file's path, and what to call them in messages.
+
+    Raises `InputError` where there is none (it says which `files` may be given), where it is no
+    TOML, or where it is of a later format.
+    """
+    entry = shelf / f"{name}.toml"
+    path = Path(name)
+    if entry.is_file() and "/" not in name:
+        return tables_of(read_text(entry), name), name
+    if path.suffix == ".toml":
+        return tables_of(read_text(path, LARGEST_TOML), str(path)), str(path)
+    known = ", ".join(sorted(p.name.removesuffix(".toml") for p in shelf.iterdir()))
+    raise InputError(f"no {kind} {name}: give one of {known}, or the path of a {files} file")
+
+
+def tables_of(text: str, where: str) -> dict[str, Any]:
+    """The tables of a TOML text without their `format`. Raises `InputError`, naming `where`."""
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{where}: not valid TOML: {error}") from None
+    found = tables.pop("format", FORMAT)
+    if type(found) is not int or found < 1:
+        raise InputError(f"{where}: format must be a whole number from 1 on, not {found!r}")
+    if found > FORMAT:
+        raise InputError(
+            f"{where}: format {found} is later than {FORMAT}, the latest that this version of "
+            "Countersteer reads: install a newer one"
+        )
+    return tables
+
+
+def toml_of(tables: Mapping[str, Any]) -> str:
+    """The text of a TOML file, with its `format`."""
+    return tomli_w.dumps({"format": FORMAT, **tables})

@@ -11,12 +11,12 @@ import numpy as np
 
 from countersteer import streams
 from countersteer.car.car import Car
-from countersteer.car.files import read_toml
 from countersteer.car.parameter import Declaration, changed, declarations, unknown_key
 from countersteer.course.course import Course
 from countersteer.errors import InputError
 from countersteer.signals import Array, Scalar
 from countersteer.streams import Stream
+from countersteer.text import read_toml
 from countersteer.world import floor
 from countersteer.world.floor import LARGEST, Floor
 

@@ -3,14 +3,12 @@
 import dataclasses
 import importlib.resources
 import math
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import tomli_w
 
 from countersteer.car.car import Car, MagicFormula, Mount, Sensors, Sonar
 from countersteer.car.parameter import (
@@ -21,33 +19,14 @@ from countersteer.car.parameter import (
     write_value,
 )
 from countersteer.errors import InputError
-from countersteer.text import read_text
+from countersteer.text import read_toml, toml_of
 
 LIBRARY = importlib.resources.files("countersteer.car") / "library"
-LARGEST = 10  # MB of a file that a person writes
 
 
 def library() -> list[str]:
     """Names of the cars that come with the package."""
     return sorted(p.name.removesuffix(".toml") for p in LIBRARY.iterdir() if p.suffix == ".toml")  # type: ignore[attr-defined]  # resources here are paths
-
-
-def read_toml(name: str, shelf: Any, kind: str, files: str = ".toml") -> tuple[dict[str, Any], str]:
-    """The tables of a library entry or of a file's path, and what to call them in messages.
-
-    Raises `InputError` where there is none, or where it is no TOML; it says which `files` may be.
-    """
-    entry = shelf / f"{name}.toml"
-    path = Path(name)
-    try:
-        if entry.is_file() and "/" not in name:
-            return tomllib.loads(read_text(entry)), name
-        if path.suffix == ".toml":
-            return tomllib.loads(read_text(path, LARGEST)), str(path)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{name}: not valid TOML: {error}") from None
-    known = ", ".join(sorted(p.name.removesuffix(".toml") for p in shelf.iterdir()))
-    raise InputError(f"no {kind} {name}: give one of {known}, or the path of a {files} file")
 
 
 def load_car(name: str, overrides: Iterable[str] = ()) -> Car:
@@ -169,7 +148,7 @@ def car_from_tables(tables: dict[str, Any], where: str) -> Car:
 
 def save_car(car: Car, path: Path, source: dict[str, str]) -> None:
     """Write a car in full. `source` says where each number is from."""
-    path.write_text(tomli_w.dumps({"source": source, **car_tables(car)}))
+    path.write_text(toml_of({"source": source, **car_tables(car)}))
 
 
 def parameters(car: Car | None = None) -> list[dict[str, Any]]:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from countersteer.car.files import read_toml
 from countersteer.car.parameter import unknown_key
 from countersteer.course.course import Course, Turn, from_segments, from_walls
 from countersteer.errors import InputError
+from countersteer.text import read_toml
 
 LIBRARY = importlib.resources.files("countersteer.course") / "library"
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.files import read_toml
 from countersteer.course.course import Course
 from countersteer.drivers import DRIVERS, plan, policy
 from countersteer.drivers.drift_turn import drift_turn
@@ -16,6 +15,7 @@ from countersteer.drivers.plan import Read
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
+from countersteer.text import read_toml
 
 
 def make_driver(

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.files import read_toml
 from countersteer.car.parameter import pytree, unknown_key
 from countersteer.course.along import Line, Place, line_of
 from countersteer.course.course import Course
@@ -28,6 +27,7 @@ from countersteer.errors import InputError
 from countersteer.estimation import spikes
 from countersteer.estimation.estimate import Estimate
 from countersteer.signals import Array, Command, Scalar
+from countersteer.text import read_toml
 
 LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
 KINDS = STRAIGHTEN, COMMANDS, DRIFT, CURVE = range(4)

@@ -23,13 +23,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tomli_w
 
-from countersteer.car.files import read_toml
 from countersteer.car.parameter import EDGE, Declaration, read_value, unknown_key, write_value
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
+from countersteer.text import read_toml, toml_of
 
 LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
 KIND = "drift-turn"
@@ -191,4 +190,4 @@ def save_policy(
 ) -> None:
     """Write a policy. `source` says where its numbers are from."""
     tables = {"kind": KIND, **policy_tables(turning, stop_angle), "source": dict(source)}
-    path.write_text(tomli_w.dumps(tables))
+    path.write_text(toml_of(tables))

@@ -9,12 +9,12 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import tomli_w
 
 from countersteer.errors import InputError
 from countersteer.runs.files import COMMANDS, TableWriter, column_rows, command_rows
 from countersteer.runs.mcap import McapWriter
 from countersteer.signals import TRUTH, Command, Readings, flat, pairs
+from countersteer.text import toml_of
 
 
 class Pace(NamedTuple):
@@ -105,7 +105,7 @@ class Recorder:
             truth = ("time_s", *(channel.name for channel in TRUTH))
             headers = {"commands": COMMANDS, "telemetry": ("time_s", *told), "truth": truth}
         assert headers is not None
-        text = tomli_w.dumps(about)
+        text = toml_of(about)
         (folder / "run.toml").write_text(text)
         self._tables = {
             name: TableWriter(folder / f"{name}.csv", header) for name, header in headers.items()

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from countersteer.car.car import Car
 from countersteer.car.files import car_from_tables, library, load_car
 from countersteer.errors import InputError
 from countersteer.runs.files import Table, read_commands, read_table
-from countersteer.text import read_text
+from countersteer.text import read_text, tables_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +69,7 @@ def read_run(path: Path) -> Run:
         raise InputError(f"{path}: no such run folder")
     if not (path / "run.toml").exists():
         raise InputError(f"{path}: not a run: it has no run.toml")
-    try:
-        about = tomllib.loads(read_text(path / "run.toml"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}/run.toml: not valid TOML: {error}") from None
+    about = tables_of(read_text(path / "run.toml"), f"{path}/run.toml")
     telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
     return Run(
         path,

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tomli_w
 
 from countersteer.car.car import Car
 from countersteer.car.files import library, load_car, save_car
@@ -14,6 +13,7 @@ from countersteer.car.parameter import EDGE, changed
 from countersteer.errors import InputError
 from countersteer.runs.defects import LogDefect, find_defects, refuse, repair
 from countersteer.runs.run import Run
+from countersteer.text import toml_of
 from countersteer.tuning import fit, shooting
 from countersteer.tuning.fit import FLOOR, Fitted, Result
 from countersteer.tuning.shooting import Shots
@@ -310,7 +310,7 @@ def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Pa
             for room in rooms:
                 table = table.setdefault(room, {})
             table[key + suffix] = fit.value_of(result.cars[name], path_inside) / factor
-        path.write_text(tomli_w.dumps(tables))
+        path.write_text(toml_of(tables))
     return files
 
 

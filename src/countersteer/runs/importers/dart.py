@@ -110,7 +110,7 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
         "throttle_masked": int(np.sum(~armed & (updates["throttle"] != 0))),
     }
     about: dict[str, Any] = {
-        "format": "dart",
+        "log_format": "dart",
         "car_name": CARS.get(log.resolve().parent.name, "jetracer"),
         "source": log.name,
         "kind": found.kind,

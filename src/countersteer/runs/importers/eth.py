@@ -66,7 +66,7 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
     steering, throttle = asked.T
     newest = observed[1:, -1] - throttle[:-1]  # the buffer's throttle is not scaled
     about: dict[str, Any] = {
-        "format": "eth",
+        "log_format": "eth",
         "car_name": "eth",
         "source": log.name,
         "kind": "motion capture with commands",
