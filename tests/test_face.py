@@ -1,8 +1,10 @@
 """The public names: a drive in five lines, from an empty folder."""
 
 import inspect
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -77,3 +79,23 @@ def test_evaluate_tells_of_one_driver():
     found = cs.evaluate("box", trials=4, seed=7, speed=(1.5, 3.0))
     assert found["trials"] == 4
     assert found["heading_overshoot_deg_p95"] >= found["heading_overshoot_deg_median"] > 0
+
+
+def test_a_wrong_word_is_answered_in_one_line():
+    for wrong in ({"link": "carrier-pigeon"}, {"estimate": "guess"}):
+        for call in (cs.drive, cs.evaluate):
+            with pytest.raises(cs.InputError, match="must be one of") as error:
+                call("box", **wrong)
+            assert "\n" not in str(error.value)
+
+
+def test_the_page_has_every_name_argument_and_member():
+    page = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
+    for name in cs.__all__:
+        assert f"cs.{name}" in page or f"`{name}`" in page or name == "Run", name
+    for call in (cs.drive, cs.evaluate, cs.load_car, cs.load_course, cs.load_driver, cs.load_run):
+        for argument in inspect.signature(call).parameters:
+            assert re.search(rf"\b{argument}\b", page), (call, argument)
+    members = [m for m in vars(cs.Run) if not m.startswith("_")]
+    for member in [*members, "columns", "commands", "telemetry", "about", "folder"]:
+        assert f"run.{member}" in page, member

@@ -583,7 +583,7 @@ def test_a_run_that_was_killed_still_has_a_page_and_a_picture(tmp_path):
 def test_a_file_of_a_later_format_is_refused_in_one_line(tmp_path, kind, read):
     file = tmp_path / f"{kind}.toml"
     file.write_text("format = 2\n")
-    with pytest.raises(InputError, match="format 2 is later than 1.*install a newer one") as error:
+    with pytest.raises(InputError, match=r"format 2 is later than 1.*install a newer one") as error:
         read(str(file))
     assert str(file) in str(error.value)
     for value in ("0", "true", '"1"', "1.5"):

@@ -116,6 +116,24 @@ def test_what_the_readme_links_to_is_there():
         assert (ROOT / target).exists(), target
 
 
+def test_what_the_map_names_is_there():
+    text = (ROOT / "docs" / "map.md").read_text()
+    names = re.findall(r"`([\w/]+(?:/|\.py|\.html))`", text)
+    assert len(names) > 40
+    for name in names:
+        assert (PACKAGE / name).exists() or (ROOT / name).exists(), name
+    rooms = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").exists()}
+    assert not {room for room in rooms if f"`{room}/" not in text}, "a room that the map lacks"
+
+
+def test_no_function_is_over_a_hundred_lines():
+    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "studies").glob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                length = node.end_lineno - node.lineno + 1
+                assert length <= 100, f"{path.name}: {node.name} has {length} lines"
+
+
 def test_pins_carry_names_and_versions_only():
     for line in (ROOT / "constraints.txt").read_text().splitlines():
         assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line), line

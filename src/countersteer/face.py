@@ -2,7 +2,7 @@
 
 import html
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from countersteer.course.files import load_course
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.library import make_driver
 from countersteer.errors import InputError
+from countersteer.estimation.library import ESTIMATORS
 from countersteer.link.link import LINKS
 from countersteer.progress import Progress
 from countersteer.recording import drive as record
@@ -112,8 +113,7 @@ def drive(
     """
     configure_jax(batches=False, cores=2)
     where, simulated = load_course(course), load_car(car, set)
-    if link not in LINKS:
-        raise InputError(f"link: one of {', '.join(LINKS)}, not {link}")
+    _check(link=(link, LINKS), estimate=(estimate, ESTIMATORS))
     what = prepare(
         where,
         simulated,
@@ -158,6 +158,7 @@ def evaluate(
     """
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     where, nominal = load_course(course), load_car(car)
+    _check(link=(link, LINKS), estimate=(estimate, ESTIMATORS))
     if where.goal_distance is None:
         raise InputError(f"{course}: has no goal, so nothing tells a success")
     seeds = range(seed, seed + trials)
@@ -168,3 +169,10 @@ def evaluate(
     with Progress() as progress:
         score = many.run(lambda v: load_driver(driver, where, nominal, v, laps), progress.show)
     return evaluation.results(score, seeds)
+
+
+def _check(**choices: tuple[str, Iterable[str]]) -> None:
+    """Raises `InputError` where an argument is none of those that there are."""
+    for name, (value, known) in choices.items():
+        if value not in known:
+            raise InputError(f"{name} must be one of {', '.join(known)}, not {value!r}")
