@@ -19,7 +19,7 @@ check: $(READY)
 	$(BIN)/mypy
 
 accuracy: $(READY)
-	$(BIN)/python -m countersteer.bench.accuracy docs/accuracy.md
+	$(BIN)/python -m benchmarks.accuracy docs/accuracy.md
 
 # Twenty fits: six minutes or more on two cores.
 recovery: $(READY)
@@ -30,7 +30,7 @@ estimation: $(READY)
 	$(BIN)/python -m studies.estimation docs/estimation.md
 
 bench: $(READY)
-	$(BIN)/countersteer bench --out docs/speed.md
+	$(BIN)/python -m benchmarks.speed docs/speed.md
 
 # Jupyter is some thirty packages: only who changes the notebook needs it.
 notebook: $(READY)

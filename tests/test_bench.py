@@ -11,12 +11,14 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks import accuracy, speed
 from countersteer import cli
 from countersteer.bench import bench
 from countersteer.bench.fleet import Fleet, advance
+from countersteer.car.files import load_car
 
 TICKS = 10
-TINY = bench.Size(rounds=1, least=0.0, cars=8, ticks=TICKS, growth=(8,), warms=0, variants=False)
+TINY = bench.Size(rounds=1, least=0.0, cars=8, ticks=TICKS, warms=0)
 # The batch in blocks, with the flags that are a process's own; what the lanes end with.
 IN_BLOCKS = f"""
 import os, sys
@@ -67,7 +69,7 @@ configure_jax()
 import jax
 from countersteer.bench import bench
 from countersteer.bench.fleet import Fleet, advance
-from countersteer.bench.native import Native
+from benchmarks.native import Native
 fleet = Fleet(64, 1, block=64)
 one_by_one = jax.jit(partial(advance, dt=bench.DT, ticks={TICKS}))
 motion = one_by_one(*fleet.inputs()).motion
@@ -86,21 +88,42 @@ def test_the_c_that_is_printed_from_jax_is_the_same_physics(tmp_path):
     np.testing.assert_allclose(ends, plain, rtol=1e-3, atol=1e-3)
 
 
-def test_bench_gives_its_figures_and_a_page(monkeypatch, capsys, tmp_path):
+def test_bench_gives_its_figures(monkeypatch, capsys):
     monkeypatch.setattr(bench, "QUICK", TINY)
-    page = tmp_path / "speed.md"
-    assert cli.main(["bench", "--quick", "--json", "--out", str(page)]) == cli.DONE
+    assert cli.main(["bench", "--quick", "--json"]) == cli.DONE
     found = json.loads(capsys.readouterr().out)
     for name in ("planar_batch_steps_per_s", "mujoco_steps_per_s", "drive_realtime_factor"):
         assert found[name] > 0
     assert {"drive_warm_s", "drive_cold_s"} <= found.keys()
     assert found["planar_over_mujoco"] > 0
-    assert found["profile"]["flops"] > 1000
+
+
+def test_the_page_on_speed_is_made(monkeypatch, tmp_path):
+    monkeypatch.setattr(speed, "GROWTH", (8,))
+    facts = {
+        "profile": {"flops": 1000, "kernels": 10, "bytes": 4000, "operations": {"add": 900}},
+        "ends": [[0.0, 1.0]], "ends_large": [[0.0, 1.001]], "converged": [[0.0, 1.0]],
+    }  # fmt: skip
+    samples = {
+        "planar_batch_steps_per_s": [2e6, 3e6], "planar_large_step_steps_per_s": [2e6],
+        "mujoco_steps_per_s": [2e4], "drive_realtime_factor": [20.0],
+        "drive_warm_s": [3.0], "drive_cold_s": [9.0], "native_steps_per_s": [8e6],
+    }  # fmt: skip
+    measured = bench.Measured(samples, facts, {"plain": "left out"}, (0.0, 0.0), 1.0)
+    monkeypatch.setattr(bench, "measure", lambda *_: measured)
+    page = tmp_path / "speed.md"
+    speed.write_page(speed.measure(TINY, lambda *_: None), page)
     text = page.read_text()
     assert "MuJoCo, all cores" in text
+    assert "0.000 mm at 1 ms, 1.000 mm at 5 ms" in text
+    assert "**The planar batch is 125 times MuJoCo.**" in text
     assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_bench_wants_a_page_it_can_write(capsys):
-    assert cli.main(["bench", "--out", "speed.txt"]) == cli.WRONG_INPUT
-    assert "speed.txt" in capsys.readouterr().err
+def test_the_manoeuvres_of_the_page_end_where_the_converged_ones_do():
+    with jax.enable_x64(False):
+        fleet = Fleet(8, 1, block=8)
+        program = jax.jit(partial(advance, dt=bench.DT, ticks=TICKS))
+        ends = np.array(speed.manoeuvres(fleet, program, TICKS))
+    converged = accuracy.positions(load_car("rx7"), 1e-3)[:, :2]
+    assert speed.error_mm(ends, converged) < 1.0

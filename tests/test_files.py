@@ -23,7 +23,7 @@ from conftest import driven, write_run
 from countersteer import cli
 from countersteer.batch.population import load_population
 from countersteer.car.files import library, load_car, parameters, save_car
-from countersteer.completion import every_action, script
+from countersteer.cli.completing import every_action, script
 from countersteer.course.course import grip_speed, place, progress
 from countersteer.course.files import library as courses
 from countersteer.course.files import load_course

@@ -50,8 +50,6 @@ MAY_IMPORT = {
         "car", "runs", "task", "world",  # a car is drawn to its size, with its forces
         "batch", "tuning",  # what came of trials and of fits
     },
-    "listing": {"car", "course"},
-    "completion": {"car", "course"},
     "cli": None,
     "face": None,  # what `import countersteer` gives
     "__init__": None,

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.batch.engine import CACHED_LANES, whole_blocks
-from countersteer.bench.accuracy import DURATION, MANOEUVRES
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.signals import Command, Wheels
@@ -101,24 +100,15 @@ class Fleet:
 
     def inputs(self) -> tuple[Any, ...]:
         """The arguments of `advance`."""
-        return self._inputs(self.states, self.commands, self.walls, 0)
+        return self.inputs_of(self.states, self.commands, self.walls, 0)
 
-    def _inputs(self, states: State, commands: Command, walls: Any, first: int) -> tuple[Any, ...]:
+    def inputs_of(
+        self, states: State, commands: Command, walls: Any, first: int
+    ) -> tuple[Any, ...]:
+        """The same from other states, commands and walls, at a tick."""
         own, same = (self.car, None) if self.varied else (None, self.car)
         return (own, states, commands), same, walls, np.int32(first)
 
     def call(self, program: Any) -> Callable[[], Any]:
         """One run of it from the start."""
         return lambda: jax.block_until_ready(program(*self.inputs()))
-
-    def manoeuvres(self, program: Any, ticks: int) -> list[list[float]]:
-        """Where (x and y, m) the lanes are at the end of the manoeuvres of docs/accuracy.md."""
-        begins = [planar.initial_state(self.car, self.dt, velocity=m.velocity) for m in MANOEUVRES]
-        lanes = np.arange(self.cars) % len(begins)
-        states = jax.tree.map(lambda *leaves: np.stack(leaves)[lanes].astype(np.float32), *begins)
-        asked = np.array([m.command for m in MANOEUVRES], np.float32)[lanes].T
-        walls = np.full_like(self.walls, np.nan)
-        for first in range(0, round(DURATION / self.dt), ticks):
-            states = program(*self._inputs(states, Command(*asked), walls, first))
-        motion = states.motion
-        return [[float(motion.x[i]), float(motion.y[i])] for i in range(len(begins))]

@@ -22,43 +22,27 @@ if TYPE_CHECKING:
 def add(verbs: Verbs) -> None:
     """The verb with its options."""
     drive = verbs.verb("drive", "one closed-loop drive over a course", run)
-    drive.add_argument(
-        "course",
-        metavar="COURSE",
-        help="library name, or a file: .toml, a centre line with widths .csv (F1TENTH), "
-        "a map .yaml with its image (ROS)",
+    meaning = (
+        "library name, or a file: .toml, a centre line with widths .csv (F1TENTH), a map .yaml "
+        "with its image (ROS)"
     )
-    drive.add_argument(
-        "--driver",
-        default="drift-turn",
-        help=f"{', '.join(DRIVERS)}, a plan's name, a policy or plan .toml, or a commands.csv "
-        "(default drift-turn)",
-    )
+    drive.add_argument("course", metavar="COURSE", help=meaning)
+    meaning = f"{', '.join(DRIVERS)}, a plan's name, a policy or plan .toml, or a commands.csv"
+    drive.option("--driver", None, str, "drift-turn", meaning)
     physics(drive, "rx7")
-    drive.add_argument(
-        "--speed-mps",
-        type=SPEEDS,
-        default=None,
-        metavar="V",
-        help="speed that the driver is asked to bring to a turn (default the driver's); with "
-        "--cars also LO:HI",
+    meaning = (
+        "speed that the driver is asked to bring to a turn (default the driver's); with --cars "
+        "also LO:HI"
     )
-    drive.add_argument(
-        "--cars",
-        metavar="SET",
-        help="drive the car, charge and start that --seed draws from this set, as evaluate does",
+    drive.option("--speed-mps", "V", SPEEDS, None, meaning)
+    meaning = "drive the car, charge and start that --seed draws from this set, as evaluate does"
+    drive.option("--cars", "SET", str, None, meaning)
+    drive.option("--battery", "F", number(0, 1), None, "charge, 0 to 1 (default 1)")
+    meaning = (
+        "a sensor that is dead, stuck or spiking for a while: 'SENSOR KIND START DURATION' in "
+        "seconds, such as 'gyroscope stuck 2.0 0.5' (repeatable)"
     )
-    drive.add_argument(
-        "--battery", type=number(0, 1), metavar="F", help="charge, 0 to 1 (default 1)"
-    )
-    drive.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="TEXT",
-        help="a sensor that is dead, stuck or spiking for a while: 'SENSOR KIND START DURATION' in "
-        "seconds, such as 'gyroscope stuck 2.0 0.5' (repeatable)",
-    )
+    drive.option("--fault", "TEXT", str, [], meaning, action="append")
     laps_and_link(drive)
 
 

@@ -24,30 +24,13 @@ def add(verbs: Verbs) -> None:
     """The verb with its options."""
     evaluate = verbs.verb("evaluate", "drivers judged over randomised cars", run)
     evaluate.add_argument("course", metavar="COURSE", help="as for drive")
-    evaluate.add_argument(
-        "--driver",
-        nargs="+",
-        default=["drift-turn"],
-        metavar="D",
-        help="as for drive, one or more (default drift-turn)",
-    )
-    evaluate.add_argument(
-        "--trials", type=number(1, 10**6, int), default=1000, metavar="N", help="default 1000"
-    )
+    meaning = "as for drive, one or more (default drift-turn)"
+    evaluate.add_argument("--driver", nargs="+", default=["drift-turn"], metavar="D", help=meaning)
+    evaluate.option("--trials", "N", number(1, 10**6, int), 1000, "random cars")
     physics(evaluate, "rx7")
-    evaluate.add_argument(
-        "--cars",
-        default="around",
-        metavar="SET",
-        help="what varies: library name or .toml file (default around)",
-    )
-    evaluate.add_argument(
-        "--speed-mps",
-        type=SPEEDS,
-        default=None,
-        metavar="LO:HI",
-        help="speed that the driver is asked to bring to a turn, drawn for each trial, or one V",
-    )
+    evaluate.option("--cars", "SET", str, "around", "what varies: library name or .toml file")
+    meaning = "speed that the driver is asked to bring to a turn, drawn for each trial, or one V"
+    evaluate.option("--speed-mps", "LO:HI", SPEEDS, None, meaning)
     laps_and_link(evaluate)
 
 

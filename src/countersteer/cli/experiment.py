@@ -13,25 +13,13 @@ from countersteer.errors import InputError
 def add(verbs: Verbs) -> None:
     """The verb with its options."""
     experiment = verbs.verb("experiment", "the paper's measurements", run)
-    experiment.add_argument(
-        "name",
-        choices=tuple(experiments.NAMES),
-        metavar="NAME",
-        help="; ".join(f"{name}: {does}" for name, does in experiments.NAMES.items()).replace(
-            "%", "%%"
-        ),
-    )
+    meaning = "; ".join(": ".join(pair) for pair in experiments.NAMES.items()).replace("%", "%%")
+    names = tuple(experiments.NAMES)
+    experiment.add_argument("name", choices=names, metavar="NAME", help=meaning)
     nominal_car(experiment)
-    experiment.add_argument(
-        "--from",
-        dest="runs",
-        nargs="+",
-        type=Path,
-        default=[],
-        metavar="RUN",
-        help="measure in these runs' folders instead, of a real car or a simulated one",
-    )
-    experiment.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
+    meaning = "measure in these runs' folders instead, of a real car or a simulated one"
+    experiment.runs("--from", meaning, dest="runs")
+    experiment.out_folder()
 
 
 def run(options: argparse.Namespace) -> int:

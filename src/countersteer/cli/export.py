@@ -18,26 +18,17 @@ def add(verbs: Verbs) -> None:
     target = export.add_mutually_exclusive_group(required=True)
     target.add_argument("--gif", type=Path, metavar="FILE", help="write an animated GIF")
     target.add_argument("--mp4", type=Path, metavar="FILE", help="write a video (H.264)")
-    export.add_argument(
-        "--width-px", type=number(160, 3840, int), default=640, metavar="PX", help="default 640"
-    )
-    export.add_argument(
-        "--fps", type=number(1, 100), metavar="N", help="frames a second (default GIF 20, MP4 25)"
-    )
-    export.add_argument(
-        "--speed",
-        type=number(0.01, 100),
-        default=1.0,
-        metavar="X",
-        help="times as fast as it was; 0.5 is slow motion (default 1)",
-    )
+    export.option("--width-px", "PX", number(160, 3840, int), 640, "of the picture")
+    meaning = "frames a second (default GIF 20, MP4 25)"
+    export.option("--fps", "N", number(1, 100), None, meaning)
+    meaning = "times as fast as it was; 0.5 is slow motion"
+    export.option("--speed", "X", number(0.01, 100), 1.0, meaning)
     export.add_argument("--follow", action="store_true", help="the camera stays with the car")
-    export.add_argument(
-        "--from-s", type=number(0, 1e6), default=0.0, metavar="S", help="begin (default the run's)"
-    )
-    export.add_argument(
-        "--to-s", type=number(0, 1e6), default=1e6, metavar="S", help="end (default the run's)"
-    )
+    for name, default in (("from", 0.0), ("to", 1e6)):
+        meaning = {"from": "begin", "to": "end"}[name] + " (default the run's)"
+        export.add_argument(
+            f"--{name}-s", type=number(0, 1e6), default=default, metavar="S", help=meaning
+        )
     export.add_argument("--force", action="store_true", help="replace a file that is there")
 
 

@@ -12,9 +12,7 @@ def add(verbs: Verbs) -> None:
     take = verbs.verb("import", "other people's logs to run folders", run)
     take.add_argument("format", choices=("dart", "eth"), metavar="FORMAT", help="dart or eth")
     take.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a log")
-    take.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of the run folders"
-    )
+    take.option("--out", "DIR", Path, None, "folder of the run folders", required=True)
 
 
 def run(options: argparse.Namespace) -> int:

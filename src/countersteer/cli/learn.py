@@ -13,67 +13,27 @@ from countersteer.errors import InputError
 def add(verbs: Verbs) -> None:
     """The verb with its options."""
     learn = verbs.group("learn", "experience to a driver's numbers", "METHOD")
-    stop = learn(
-        "stop-angle",
-        "how far a car still turns once it is stopped: lines over the yaw rate, by speed",
-        run_stop_angle,
-    )
-    stop.add_argument(
-        "sources",
-        nargs="+",
-        type=Path,
-        metavar="TABLE_OR_RUN",
-        help="a turns.csv, the folder of trials turns, or a run's folder",
-    )
-    stop.add_argument(
-        "--out", type=Path, required=True, metavar="POLICY.toml", help="where the policy is written"
-    )
-    stop.add_argument(
-        "--most-deg",
-        type=number(1, 360),
-        default=90.0,
-        metavar="DEG",
-        help="leave out turns that ran on for more than this (default 90)",
-    )
+    does = "how far a car still turns once it is stopped: lines over the yaw rate, by speed"
+    stop = learn("stop-angle", does, run_stop_angle)
+    meaning = "a turns.csv, the folder of trials turns, or a run's folder"
+    stop.add_argument("sources", nargs="+", type=Path, metavar="TABLE_OR_RUN", help=meaning)
+    stop.out_file("POLICY.toml", "policy")
+    meaning = "leave out turns that ran on for more than this"
+    stop.option("--most-deg", "DEG", number(1, 360), 90.0, meaning)
 
-    turn = learn(
-        "turn",
-        "the numbers of the drift-turn driver, by driving random cars with many candidates",
-        run_turn,
-    )
+    does = "the numbers of the drift-turn driver, by driving random cars with many candidates"
+    turn = learn("turn", does, run_turn)
     turn.add_argument("courses", nargs="+", metavar="COURSE", help="as for drive; by turns")
-    turn.add_argument("--car", default="rx7", help="the nominal one (default rx7)")
-    turn.add_argument("--cars", default="around", metavar="SET", help="as for evaluate")
-    turn.add_argument(
-        "--begin",
-        default="drift-turn",
-        metavar="POLICY",
-        help="where the search begins (default that of the driver)",
-    )
-    turn.add_argument(
-        "--generations", type=number(1, 1000, int), default=30, metavar="N", help="default 30"
-    )
-    turn.add_argument(
-        "--candidates", type=number(4, 1024, int), default=32, metavar="N", help="default 32"
-    )
-    turn.add_argument(
-        "--trials",
-        type=number(1, 1024, int),
-        default=48,
-        metavar="N",
-        help="random cars that each of them drives (default 48)",
-    )
-    turn.add_argument(
-        "--spread",
-        type=number(0.001, 10),
-        default=0.5,
-        metavar="X",
-        help="how far it looks at first: 1 for another car, 0.2 to polish (default 0.5)",
-    )
-    turn.add_argument("--seed", type=number(0, 2**30, int), default=0, help="default 0")
-    turn.add_argument(
-        "--out", type=Path, required=True, metavar="POLICY.toml", help="where the policy is written"
-    )
+    turn.option("--car", None, str, "rx7", "the nominal one")
+    turn.option("--cars", "SET", str, "around", "as for evaluate")
+    turn.option("--begin", "POLICY", str, "drift-turn", "where the search begins")
+    turn.option("--generations", "N", number(1, 1000, int), 30, "steps of the search")
+    turn.option("--candidates", "N", number(4, 1024, int), 32, "policies tried in each of them")
+    turn.option("--trials", "N", number(1, 1024, int), 48, "random cars that each policy drives")
+    meaning = "how far it looks at first: 1 for another car, 0.2 to polish"
+    turn.option("--spread", "X", number(0.001, 10), 0.5, meaning)
+    turn.seed()
+    turn.out_file("POLICY.toml", "policy")
 
 
 def run_stop_angle(options: argparse.Namespace) -> int:

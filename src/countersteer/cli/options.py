@@ -25,6 +25,32 @@ class Parser(argparse.ArgumentParser):
         """Raises `InputError` with what argparse found."""
         raise InputError(f"{message} (see {self.prog} --help)")
 
+    def option(
+        self, name: str, metavar: str | None, kind: Any, default: Any, meaning: str, **more: Any
+    ) -> None:
+        """An option that takes a value. Its help says the default, where there is one."""
+        shown = default not in (None, [])
+        text = f"{meaning} (default %(default)s)" if shown else meaning
+        self.add_argument(
+            name, metavar=metavar, type=kind, default=default, help=text.lstrip(), **more
+        )
+
+    def runs(self, name: str, meaning: str, **more: Any) -> None:
+        """An option that takes the folders of runs."""
+        self.option(name, "RUN", Path, [], meaning, nargs="+", **more)
+
+    def out_file(self, metavar: str, what: str) -> None:
+        """`--out`, which must be given."""
+        self.option("--out", metavar, Path, None, f"where the {what} is written", required=True)
+
+    def out_folder(self) -> None:
+        """`--out`, a folder."""
+        self.option("--out", "DIR", Path, None, "default a new one in runs/")
+
+    def seed(self) -> None:
+        """`--seed`."""
+        self.option("--seed", None, number(0, 2**31 - 1, int), 0, "of all that is random")
+
 
 class Verbs:
     """The verbs of a parser; each file of this room adds its own."""
@@ -88,56 +114,34 @@ SPEEDS, CHARGES = span(0.2, 20), span(0, 1)  # m/s; of a battery
 
 def nominal_car(made: Parser, car: str | None = "rx7") -> None:
     """`--car` and `--set`."""
-    default = f"default {car}" if car else "default the run's own, else rx7"
-    made.add_argument("--car", default=car, help=f"library name or .toml file ({default})")
-    made.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="PATH=VALUE",
-        help="override a parameter of the car, such as battery.wear=0.5 (repeatable; "
-        "'countersteer list parameters' has them all)",
+    default = "" if car else " (default the run's own, else rx7)"
+    made.option("--car", None, str, car, f"library name or .toml file{default}")
+    meaning = (
+        "override a parameter of the car, such as battery.wear=0.5 (repeatable; 'countersteer list "
+        "parameters' has them all)"
     )
+    made.option("--set", "PATH=VALUE", str, [], meaning, action="append")
 
 
 def physics(made: Parser, car: str | None) -> None:
     """The same with `--seed`, `--dt` and `--out`."""
     nominal_car(made, car)
-    made.add_argument("--seed", type=number(0, 2**31 - 1, int), default=0, help="default 0")
-    made.add_argument(
-        "--dt",
-        type=number(1e-5, 0.02),
-        default=0.001,
-        metavar="S",
-        help="physics step in seconds (default 0.001)",
-    )
-    made.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
+    made.seed()
+    made.option("--dt", "S", number(1e-5, 0.02), 0.001, "physics step in seconds")
+    made.out_folder()
 
 
 def laps_and_link(made: Parser) -> None:
     """`--laps`, `--link` and `--estimate`."""
-    made.add_argument(
-        "--laps",
-        type=number(1, 1000, int),
-        default=1,
-        metavar="N",
-        help="of a closed course (default 1)",
+    made.option("--laps", "N", number(1, 1000, int), 1, "of a closed course")
+    meaning = "where the driver runs: in the car, or behind a radio that delays and loses packets"
+    made.option("--link", None, str, "onboard", meaning, choices=("onboard", "radio"))
+    meaning = (
+        "what the driver knows of its motion: by the velocity filter, by dead reckoning, or by a "
+        "particle filter of the pose (slower), all from the sensors; or the truth"
     )
-    made.add_argument(
-        "--link",
-        choices=("onboard", "radio"),
-        default="onboard",
-        help="where the driver runs: in the car, or behind a radio that delays and loses "
-        "packets (default onboard)",
-    )
-    made.add_argument(
-        "--estimate",
-        choices=("filter", "pose", "reckoning", "truth"),
-        default="filter",
-        help="what the driver knows of its motion: by the velocity filter (default), dead "
-        "reckoning, by a particle filter of the pose (slower), all from the sensors; or the "
-        "truth",
-    )
+    kinds = ("filter", "pose", "reckoning", "truth")
+    made.option("--estimate", None, str, "filter", meaning, choices=kinds)
 
 
 def check_laps(options: argparse.Namespace, course: "Course") -> None:

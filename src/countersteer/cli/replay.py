@@ -21,27 +21,22 @@ INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
 def add(verbs: Verbs) -> None:
     """The verb with its options."""
     replay = verbs.verb("replay", "commands in, motion out; or a log against the simulator", run)
-    replay.add_argument(
-        "source", type=Path, metavar="COMMANDS_OR_RUN", help="a commands.csv, or a run's folder"
-    )
+    meaning = "a commands.csv, or a run's folder"
+    replay.add_argument("source", type=Path, metavar="COMMANDS_OR_RUN", help=meaning)
     physics(replay, None)
-    replay.add_argument(
-        "--initial", default="", metavar="STATES", help='such as "vx_mps=2,yaw_rate_radps=1"'
+    meaning = 'such as "vx_mps=2,yaw_rate_radps=1"'
+    replay.add_argument("--initial", default="", metavar="STATES", help=meaning)
+    meaning = (
+        "charge, 0 to 1 (default: the run's battery_charge, or else 1; with --compare, or else "
+        "what agrees best)"
     )
-    replay.add_argument(
-        "--battery",
-        type=number(0, 1),
-        metavar="F",
-        help="charge, 0 to 1 (default: the run's battery_charge, or else 1; with --compare, "
-        "or else what agrees best)",
-    )
+    replay.option("--battery", "F", number(0, 1), None, meaning)
     replay.add_argument("--compare", action="store_true", help="measured against simulated")
-    replay.add_argument(
-        "--horizon",
-        metavar="S|run",
-        help="seconds that are predicted at a time, or run: the whole of it (with --compare; "
-        "default 1.0)",
+    meaning = (
+        "seconds that are predicted at a time, or run: the whole of it (with --compare; default "
+        "1.0)"
     )
+    replay.option("--horizon", "S|run", str, None, meaning)
 
 
 def run(options: argparse.Namespace) -> int:

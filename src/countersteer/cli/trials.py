@@ -12,65 +12,31 @@ from countersteer.cli.options import CHARGES, DONE, SPEEDS, Progress, Verbs, nom
 def add(verbs: Verbs) -> None:
     """The verb with its options."""
     trials = verbs.group("trials", "many drives, or commands for them", "WHAT")
-    steps = trials(
-        "throttle-steps",
-        "commands: from rest, straight, each a second at one throttle, then none",
-        run_steps,
+    does = "commands: from rest, straight, each a second at one throttle, then none"
+    steps = trials("throttle-steps", does, run_steps)
+    steps.option("--out", "DIR", Path, None, "folder of the files", required=True)
+    steps.option(
+        "--levels", "LIST", str, None, "throttles, such as 0.2,0.5 (default ten, 0.1 to 1)"
     )
-    steps.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the files")
-    steps.add_argument(
-        "--levels", metavar="LIST", help="throttles, such as 0.2,0.5 (default ten, 0.1 to 1)"
-    )
-    steps.add_argument(
-        "--duration-s",
-        type=number(0.01, 60),
-        default=1.0,
-        metavar="S",
-        help="at each throttle (default 1)",
-    )
-    steps.add_argument(
-        "--rate-hz",
-        type=number(1, 1000),
-        default=100.0,
-        metavar="HZ",
-        help="rows a second (default 100)",
-    )
-    turns = trials(
-        "turns",
-        "turns in the open, stopped at different yaw rates: time and angle until stopped",
-        run_turns,
-    )
+    steps.option("--duration-s", "S", number(0.01, 60), 1.0, "at each throttle")
+    steps.option("--rate-hz", "HZ", number(1, 1000), 100.0, "rows a second")
+    does = "turns in the open, stopped at different yaw rates: time and angle until stopped"
+    turns = trials("turns", does, run_turns)
     nominal_car(turns)
+    meaning = "draw each trial's car from this set (default the car itself)"
+    turns.option("--cars", "SET", str, None, meaning)
+    turns.option("--trials", "N", number(1, 10**6, int), 1000, "turns")
+    meaning = "drawn for each trial, or one V (default 1:3)"
     turns.add_argument(
-        "--cars", metavar="SET", help="draw each trial's car from this set (default the car itself)"
+        "--speed-mps", type=SPEEDS, default=(1.0, 3.0), metavar="LO:HI", help=meaning
     )
-    turns.add_argument(
-        "--trials", type=number(1, 10**6, int), default=1000, metavar="N", help="default 1000"
-    )
-    turns.add_argument(
-        "--speed-mps", type=SPEEDS, default=(1.0, 3.0), metavar="LO:HI", help="default 1:3"
-    )
-    turns.add_argument(
-        "--battery",
-        type=CHARGES,
-        default=None,
-        metavar="LO:HI",
-        help="charge, 0 to 1 (default the set's, or 0.3:1)",
-    )
-    turns.add_argument(
-        "--driver", default="drift-turn", metavar="POLICY", help="whose turns (default drift-turn)"
-    )
-    turns.add_argument("--seed", type=number(0, 2**31 - 1, int), default=0, help="default 0")
-    turns.add_argument("--out", type=Path, metavar="DIR", help="default a new one in runs/")
-    turns.add_argument(
-        "--from",
-        dest="runs",
-        nargs="+",
-        type=Path,
-        default=[],
-        metavar="RUN",
-        help="find the turns in these runs' folders instead, of a real car or a simulated one",
-    )
+    meaning = "charge, 0 to 1 (default the set's, or 0.3:1)"
+    turns.option("--battery", "LO:HI", CHARGES, None, meaning)
+    turns.option("--driver", "POLICY", str, "drift-turn", "whose turns")
+    turns.seed()
+    turns.out_folder()
+    meaning = "find the turns in these runs' folders instead, of a real car or a simulated one"
+    turns.runs("--from", meaning, dest="runs")
 
 
 def run_steps(options: argparse.Namespace) -> int:

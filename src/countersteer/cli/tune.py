@@ -18,57 +18,31 @@ def add(verbs: Verbs) -> None:
     """The verb with its options."""
     tune = verbs.verb("tune", "logs of a car to the car's numbers", run)
     tune.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run's folder")
-    tune.add_argument(
-        "--car",
-        default="rx7",
-        metavar="BASE",
-        help="where the fit begins, and what is not fitted: library name or .toml (default rx7)",
+    meaning = "where the fit begins, and what is not fitted: library name or .toml"
+    tune.option("--car", "BASE", str, "rx7", meaning)
+    meaning = (
+        "acceleration: the motor's strength from steps of throttle; longitudinal: motor, battery, "
+        "rolling, braking; steering: servo and its map; handling: yaw inertia and grip; drift: "
+        "combined slip past the limit; all: these in turn, then everything at once"
     )
-    tune.add_argument(
-        "--fit",
-        default="all",
-        choices=("acceleration", "longitudinal", "steering", "handling", "drift", "all"),
-        help="acceleration: the motor's strength from steps of throttle; longitudinal: motor, "
-        "battery, rolling, braking; steering: servo and its map; handling: yaw inertia and grip; "
-        "drift: combined slip past the limit; all: these in turn, then everything at once "
-        "(default all)",
+    kinds = ("acceleration", "longitudinal", "steering", "handling", "drift", "all")
+    tune.option("--fit", None, str, "all", meaning, choices=kinds)
+    tune.out_file("CAR.toml", "car")
+    tune.runs("--validate", "judge on these runs")
+    meaning = (
+        "runs since BASE was fitted to the others: fit to all, and say by how much BASE errs more "
+        "on these, and whether the driver should be learned again"
     )
-    tune.add_argument(
-        "--out", type=Path, required=True, metavar="CAR.toml", help="where the car is written"
+    tune.runs("--new", meaning)
+    meaning = (
+        "1: keep every third block of 2 s of each run back and judge on it (default 1 without "
+        "--validate)"
     )
-    tune.add_argument(
-        "--validate", nargs="+", type=Path, default=[], metavar="RUN", help="judge on these runs"
-    )
-    tune.add_argument(
-        "--new",
-        nargs="+",
-        type=Path,
-        default=[],
-        metavar="RUN",
-        help="runs since BASE was fitted to the others: fit to all, and say by how much BASE errs "
-        "more on these, and whether the driver should be learned again",
-    )
-    tune.add_argument(
-        "--hold-out",
-        type=number(0, 1, int),
-        default=None,
-        metavar="0|1",
-        help="1: keep every third block of 2 s of each run back and judge on it (default 1 "
-        "without --validate)",
-    )
-    tune.add_argument(
-        "--source",
-        choices=("encoder", "sonar", "lines"),
-        default="encoder",
-        help="with --fit acceleration: what tells the speed (default encoder)",
-    )
-    tune.add_argument(
-        "--precision",
-        type=number(1e-9, 1),
-        default=1e-3,
-        metavar="PART",
-        help="with --fit acceleration: done when it changes by less (default 0.001)",
-    )
+    tune.option("--hold-out", "0|1", number(0, 1, int), None, meaning)
+    meaning = "with --fit acceleration: what tells the speed"
+    tune.option("--source", None, str, "encoder", meaning, choices=("encoder", "sonar", "lines"))
+    meaning = "with --fit acceleration: done when it changes by less"
+    tune.option("--precision", "PART", number(1e-9, 1), 1e-3, meaning)
 
 
 def run(options: argparse.Namespace) -> int:

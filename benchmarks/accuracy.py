@@ -1,4 +1,4 @@
-"""Error of the position against the step: `python -m countersteer.bench.accuracy PAGE`."""
+"""Error of the position against the step: `python -m benchmarks.accuracy PAGE`."""
 
 import sys
 from pathlib import Path

@@ -1,0 +1,1 @@
+"""What makes the pages on speed and accuracy, and nobody else runs."""
