@@ -4,15 +4,10 @@ import dataclasses
 
 import jax.numpy as jnp
 
+import countersteer as cs
 from countersteer.car.car import Car
-from countersteer.car.files import load_car
 from countersteer.car.parameter import pytree
-from countersteer.compiling import configure_jax
-from countersteer.course.files import load_course
-from countersteer.drivers.straighten import straighten
-from countersteer.pilot import Pilot
 from countersteer.signals import Command, Motion, Scalar, Wheels
-from countersteer.simulator import Simulator
 from countersteer.world.world import Events
 
 
@@ -51,10 +46,9 @@ class Kinematic:
 
 
 if __name__ == "__main__":
-    configure_jax(batches=False)
-    course, car = load_course("straight"), load_car("rx7")
-    pilot = Pilot.of(straighten(course, car), course, car)
+    course, car = cs.load_course("straight"), cs.load_car("rx7")
+    pilot = cs.Pilot.of(cs.load_driver("straighten", course, car), course, car)
     world = lambda car, walls, floor, dt: Kinematic(car=car, dt=dt)  # noqa: E731  # one line
-    simulator = Simulator.of(course, car, world=world, start=(0.5, 0.2, 0.1))
+    simulator = cs.Simulator.of(course, car, world=world, start=(0.5, 0.2, 0.1))
     for m in (record.motion for record in simulator.run(pilot, longest=2.5)):
         print(f"x {m.x[-1]:5.2f} m   y {m.y[-1]:+.3f} m   {m.vx[-1]:.2f} m/s")

@@ -2,14 +2,7 @@
 
 import sys
 
-from countersteer.car.files import load_car
-from countersteer.compiling import configure_jax
-from countersteer.course.files import load_course
-from countersteer.drivers.driver import Observation
-from countersteer.errors import InputError
-from countersteer.pilot import Pilot
-from countersteer.signals import Command
-from countersteer.simulator import Simulator
+import countersteer as cs
 
 
 class WallFollower:
@@ -22,24 +15,23 @@ class WallFollower:
         """The memory at the start: how much farther the left wall is than the right one."""
         return 0.0
 
-    def act(self, memory: float, observation: Observation) -> tuple[Command, float]:
+    def act(self, memory: float, observation: cs.Observation) -> tuple[cs.Command, float]:
         """Sonar: front, left, right, in metres. Steering in rad, positive to the left."""
         front, left, right = (heard.value for heard in observation.sonar)
         memory += 0.1 * (min(left, 2.0) - min(right, 2.0) - memory)
         steering = 0.4 * memory - observation.estimate.heading  # the corridor's is 0
         throttle = 0.35 if front > 1.5 and observation.wheel_speed.value < 1.5 else 0.0
-        return Command(throttle, max(-0.4, min(0.4, steering))), memory
+        return cs.Command(throttle, max(-0.4, min(0.4, steering))), memory
 
 
 if __name__ == "__main__":
-    configure_jax(batches=False)  # what JAX compiles is kept: the second start takes no time
-    course, car = load_course("straight"), load_car("rx7")
-    pilot, simulator = Pilot.of(WallFollower(), course, car), Simulator.of(course, car)
+    course, car = cs.load_course("straight"), cs.load_car("rx7")
+    pilot, simulator = cs.Pilot.of(WallFollower(), course, car), cs.Simulator.of(course, car)
     print("the first start compiles for some seconds", flush=True)
     try:
         for record in simulator.run(pilot, longest=3.0):
             t, m = simulator.dt * record.tick[-1], record.motion
             words = f"x {m.x[-1]:5.2f} m   y {m.y[-1]:+.2f} m   {m.vx[-1]:.2f} m/s"
             print(f"{t:4.1f} s   {words}", flush=True)
-    except InputError as error:
+    except cs.InputError as error:
         sys.exit(str(error))

@@ -78,7 +78,9 @@ def test_a_stop_that_is_broken_off_or_too_slow_or_never_comes_is_none():
 
 def write_run(folder: Path, series: Series, truth: bool) -> Path:
     folder.mkdir()
-    (folder / "run.toml").write_text("battery_charge = 0.7\n")
+    (folder / "run.toml").write_text(
+        "battery_charge = 0.7\n[sensors]\nencoder.lag_s = 0.06\ngyroscope.lag_s = 0.05\n"
+    )
     told = zip(TIME, series.throttle, np.degrees(series.steering), strict=True)
     lines = [f"{t:.3f},{u:g},forward,{angle:.6f}" for t, u, angle in told]
     (folder / "commands.csv").write_text(

@@ -11,7 +11,7 @@
 | `load_car`, `load_course`, `load_driver`, `load_run` | by a library name or a file's path |
 | `Run` | a recorded drive: outcome, turns, columns; a notebook shows its report |
 | `Simulator`, `Pilot`, `Task` | what is driven, what drives, what judges: step them yourself |
-| `Command` | what a driver of your own returns |
+| `Observation`, `Command` | what a driver of your own is told, and returns |
 
 Each is loaded as it is first asked for, and JAX is configured then. Errors in what you give are
 `InputError`, with one line that says what to do. Units are in the names; inside all is SI and rad.
@@ -34,6 +34,7 @@ _NAMES = {
     "Pilot": "pilot",
     "Task": "task.task",
     "Command": "signals",
+    "Observation": "drivers.driver",
     "InputError": "errors",
 }
 __all__ = list(_NAMES)
