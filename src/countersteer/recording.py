@@ -17,7 +17,6 @@ from countersteer.car.files import car_tables, load_car
 from countersteer.course.course import Course
 from countersteer.course.files import course_tables
 from countersteer.drivers.library import make_driver
-from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
 from countersteer.runs.files import read_commands
@@ -64,8 +63,7 @@ def prepare(
     `speed` (m/s) is what the driver is asked to bring to a turn, `charge` the battery's, 0 to 1.
     Raises `InputError` where one of them is not what it should be.
     """
-    if laps > 1 and not course.closed:
-        raise InputError(f"--laps {laps}: {course.name} is open, and driven once")
+    course.check_laps(laps)
     nominal = load_car(car_name)
     made, tables = make_driver(driver, course, nominal, speed, laps, read_commands)
     pilot = Pilot.of(made, course, nominal, estimate, link, dt)

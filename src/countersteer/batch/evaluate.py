@@ -14,6 +14,7 @@ from countersteer.batch.trials import Watch, run_trials
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
+from countersteer.errors import InputError
 from countersteer.link.link import Link
 from countersteer.pilot import Pilot
 from countersteer.sensing.faults import SensorFault
@@ -40,6 +41,12 @@ class Trials:
     link: Link
     estimate: str
     dt: float
+
+    def __post_init__(self) -> None:
+        """Raises `InputError` where no drive of the course could succeed."""
+        self.course.check_laps(self.laps)
+        if self.course.goal_distance is None:
+            raise InputError(f"{self.course.name}: has no goal, so nothing tells a success")
 
     def run(
         self,

@@ -12,12 +12,10 @@ from countersteer.cli.options import (
     SPEEDS,
     Progress,
     Verbs,
-    check_laps,
     laps_and_link,
     number,
     physics,
 )
-from countersteer.errors import InputError
 
 
 def add(verbs: Verbs) -> None:
@@ -49,9 +47,6 @@ def run(options: argparse.Namespace) -> int:
 
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     course, car = load_course(options.course), load_car(options.car, options.set)
-    check_laps(options, course)
-    if course.goal_distance is None:
-        raise InputError(f"{options.course}: has no goal, so nothing tells a success")
     nominal, population = load_car(options.car), load_population(options.cars)
     seeds = range(options.seed, options.seed + options.trials)
     trials = evaluate.Trials(

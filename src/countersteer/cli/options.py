@@ -4,13 +4,10 @@ import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from countersteer.errors import InputError
 from countersteer.progress import Progress
-
-if TYPE_CHECKING:
-    from countersteer.course.course import Course
 
 __all__ = ["Progress"]  # and all else that is defined here
 
@@ -142,12 +139,6 @@ def laps_and_link(made: Parser) -> None:
     )
     kinds = ("filter", "pose", "reckoning", "truth")
     made.option("--estimate", None, str, "filter", meaning, choices=kinds)
-
-
-def check_laps(options: argparse.Namespace, course: "Course") -> None:
-    """Only a closed course has laps."""
-    if options.laps > 1 and not course.closed:
-        raise InputError(f"--laps {options.laps}: {options.course} is open, and driven once")
 
 
 def plans() -> dict[str, str]:

@@ -59,6 +59,11 @@ class Course:
             return None
         return self.goal_distance + (laps - 1) * self.length if self.closed else self.goal_distance
 
+    def check_laps(self, laps: int) -> None:
+        """Raises `InputError` where the course cannot be driven so many times."""
+        if laps > 1 and not self.closed:
+            raise InputError(f"--laps {laps}: {self.name} is open, and driven once")
+
     def turns_ahead(self, laps: int) -> list[Turn]:
         """The turns between start and goal, at unwrapped distances, in the order driven."""
         end = self.lap_end(laps)

@@ -352,23 +352,6 @@ def library() -> dict[str, str]:
     return {n: str(t["description"]) for n, t in tables.items() if t["kind"] == "plan"}
 
 
-def is_plan(name: str) -> bool:
-    """Whether a driver's name is a plan's: of the library, or a file of this kind."""
-    if name.endswith(".toml"):
-        return bool(read_toml(name, LIBRARY, "driver")[0].get("kind") == "plan")
-    return name in library()
-
-
-def load_plan(
-    name: str, course: Course, car: Car, read: Read, speed: float | None = None, laps: int = 1
-) -> PolicySequence:
-    """A plan from the library or a file."""
-    tables, where = read_toml(name, LIBRARY, "driver")
-    if tables.get("kind") != "plan":
-        raise InputError(f'{where}: kind must be "plan", not {tables.get("kind")!r}')
-    return plan(tables, where, course, car, read, speed, laps)
-
-
 def _policy(
     row: dict[str, Any], where: str, speed: float, length: float, folder: Path, read: Read
 ) -> Policies:
