@@ -1,8 +1,8 @@
-"""What is false in a log: stretches that a fit must leave out, and logs that it must refuse.
+"""Defects of a log: stretches that a fit must leave out, and logs that it must refuse.
 
-`refuse` raises where a whole column cannot mean what its name says. `find_defects` lists stretches.
-`repair` mends what can be mended without a guess. All three take any run: an imported log, one of
-the simulator, a real car's. What a log does not hold is not judged.
+`refuse` raises `InputError` if a column as a whole contradicts its name, for example in another
+unit. `find_defects` lists stretches. `repair` makes the repairs that need no guess. All three take
+any run: imported, simulated, or of a real car. Data that a log lacks are not judged.
 """
 
 import dataclasses
@@ -19,75 +19,75 @@ from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 
 # Clocks
-MISSED = 5.0  # periods without a row that are a gap: one or two late rows are any log's
-ROWS = 20  # fewer do not tell a period
-SLOWEST_CLOCK = 0.5  # s; no sensor's rows are so far apart, but a clock in ms seems so
+MISSED = 5.0  # periods between two rows that make a gap; every log has one or two late rows
+ROWS = 20  # fewest rows that give a period
+SLOWEST_CLOCK = 0.5  # s between rows; no sensor is so slow, so time_s may be in milliseconds
 
 # Motion capture
-SLACK, SLACK_YAW = 0.02, 0.1  # m, rad; noise that no speed is concluded from
-ABRUPT, ABRUPT_YAW = 3.0, 20.0  # m/s, rad/s by which one step may exceed those around it
-AROUND = 0.3  # s that tell how fast the car is about an instant
-STANDS = 0.1  # m/s; below, a frame may repeat the one before
-FALSE_YAW_RATE = 3.0  # rad/s off the heading's own rate: the largest honest one in the logs is 1.3
+SLACK, SLACK_YAW = 0.02, 0.1  # m, rad; noise of poses, too small to give a speed
+ABRUPT, ABRUPT_YAW = 3.0, 20.0  # m/s, rad/s; largest excess of a rate over the median around it
+AROUND = 0.3  # s, window of that median
+STANDS = 0.1  # m/s; a slower car may repeat a frame
+FALSE_YAW_RATE = 3.0  # rad/s off the heading's rate; correct ones in the logs reach 1.3
 
-# Collisions. The best tyre on rubber reaches about 1 g; the hardest braking in the logs is 0.98 g,
+# Collisions. The best tyre on rubber reaches about 1 g. The hardest braking in the logs is 0.98 g,
 # the mildest hit 1.7 g.
 BEST_FRICTION, MARGIN = 1.0, 1.5
-SPAN_OF_POSES = 0.05  # s over which poses are differenced: 1 mm of noise then is 1 m/s²
-SPAN_OF_VELOCITIES = 0.01  # s, for velocities that are there already
-BEFORE, AFTER = 0.05, 0.2  # s that a hit is taken to last beyond what shows
-IMPACT_RATE = 50.0  # Hz; slower accelerometers show a single vibration as they show a hit
-QUIET = 6.0  # standard deviations of an accelerometer that is read as noise
+SPAN_OF_POSES = 0.05  # s between differenced poses; 1 mm of noise then gives 1 m/s²
+SPAN_OF_VELOCITIES = 0.01  # s, the same for measured velocities
+BEFORE, AFTER = 0.05, 0.2  # s added before and after the visible hit
+IMPACT_RATE = 50.0  # Hz; at a lower rate, a single vibration looks like a hit
+QUIET = 6.0  # standard deviations of an accelerometer's noise that are added to the limit
 
 # Stuck sensors
-HELD, HELD_ALONE = 0.5, 1.0  # s of one reading, with motion capture to judge it and without
-READINGS = 5  # of one value in a row, at least
-APART = 0.5  # m/s between wheels and car that slip in grip and a turn do not explain
-TURNS = 0.7  # rad/s that a gyroscope cannot miss
-DRIVEN, FULL = 0.1, 0.5  # throttle beyond any dead zone's doubt, with and without motion capture
-STEERED = math.radians(5)  # a change that a moving car answers
+HELD, HELD_ALONE = 0.5, 1.0  # s of a constant reading: with other evidence of motion, and without
+READINGS = 5  # fewest readings: equal ones in a row, or ones beyond a limit
+APART = 0.5  # m/s between wheels and car; slip within grip and turning explain less
+TURNS = 0.7  # rad/s off the true yaw rate; a working gyroscope is closer
+DRIVEN, FULL = 0.1, 0.5  # throttle above every dead zone: with motion capture, and without
+STEERED = math.radians(5)  # rad; so much steering, or change of it, turns a moving car
 
 # Units
-FASTEST, FASTEST_YAW = 30.0, 60.0  # m/s, rad/s: no model car's
-STEEPEST = math.radians(65)  # the largest lock that a car may declare
-DEGREES = (45.0, 72.0)  # a ratio in here is that of degrees to radians
-UNITS = {
+FASTEST, FASTEST_YAW = 30.0, 60.0  # m/s, rad/s; no model car reaches them
+STEEPEST = math.radians(65)  # rad, the largest steering limit that a car may declare
+DEGREES = (45.0, 72.0)  # range of value / true value if the value is in degrees
+UNITS = {  # the same of speeds in other units
     "cm/s": (80.0, 125.0),
     "km/h": (3.2, 4.0),
     "mm/s": (800.0, 1250.0),
 }
-TELLING = 20  # samples that a ratio is concluded from
+TELLING = 20  # fewest samples for a ratio
 
 
 class LogDefect(NamedTuple):
-    """A stretch of a log that says what was not so."""
+    """A stretch of a log in which one column or all columns are false."""
 
     start: float  # s
     end: float
-    what: str  # for a person
-    column: str = ""  # that is false; empty: nothing of the log holds there
+    what: str  # message for a person
+    column: str = ""  # the false column; empty: all columns
 
 
 class Track(NamedTuple):
-    """Motion capture without its false frames; velocities NaN where they are not known."""
+    """Velocities from motion capture without its false frames; NaN where unknown."""
 
-    time: np.ndarray
-    east: np.ndarray  # velocity in the world's axes, m/s
+    time: np.ndarray  # s
+    east: np.ndarray  # m/s, in the world's axes
     north: np.ndarray
-    vx: np.ndarray  # in the body's
+    vx: np.ndarray  # m/s, in the body's axes
     vy: np.ndarray
-    yaw_rate: np.ndarray
-    span: float  # s that a velocity is the mean over
+    yaw_rate: np.ndarray  # rad/s
+    span: float  # s, averaging time of a velocity
 
     def at(self, values: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Values at other times; NaN where they are not known."""
+        """Interpolate a column of the track to other times; NaN where unknown."""
         return np.interp(time, self.time, values, left=math.nan, right=math.nan)
 
 
 def find_defects(run: Run) -> list[LogDefect]:
-    """Stretches of the run that a fit must leave out, by time.
+    """Stretches of the run that a fit must leave out, sorted by start.
 
-    Raises `InputError`, naming file and time, where the log cannot be used at all.
+    Raises `InputError` with file and time if the whole log is unusable.
     """
     refuse(run)
     run, _ = repair(run)
@@ -104,7 +104,10 @@ def find_defects(run: Run) -> list[LogDefect]:
 
 
 def repair(run: Run) -> tuple[Run, list[str]]:
-    """The run with its heading unwrapped, and a line for each repair; the same run if none."""
+    """The run with its heading unwrapped, and a line for each repair.
+
+    A run that needs no repair is returned as it is.
+    """
     truth = run.truth
     if truth is None or not len(truth):
         return run, []
@@ -128,7 +131,10 @@ def stretches(where: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def period(time: np.ndarray) -> float:
-    """The usual time between two rows (s); NaN where rows are too few or come at no rate."""
+    """The median time between two rows (s); NaN if rows are too few or irregular.
+
+    Rows are irregular if a fifth of the steps or more are off the median by over half of it.
+    """
     steps = np.diff(time)
     if len(time) < ROWS:
         return math.nan
@@ -137,7 +143,7 @@ def period(time: np.ndarray) -> float:
 
 
 def asked(run: Run, name: str, time: np.ndarray) -> np.ndarray:
-    """Throttle or steering at these times; 0 before the first command."""
+    """The throttle or steering command at these times; 0 before the first command."""
     last = np.searchsorted(run.commands["time_s"], time + 1e-6, side="right") - 1
     return np.where(last >= 0, run.commands[name][np.maximum(last, 0)], 0.0)
 
@@ -152,26 +158,27 @@ def readings(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 # -------------------------------------------------------------------------------------------------
-# What is not there
+# Missing data
 # -------------------------------------------------------------------------------------------------
 
 
 def gaps(run: Run) -> Iterator[LogDefect]:
-    """Rows, or reports of one sensor, that come too late or twice at once."""
+    """Gaps between rows or between reports of a sensor, and rows with the same time."""
     tables = {"commands": run.commands, "telemetry": run.telemetry, "truth": run.truth}
     for name, table in tables.items():
         if table is None:
             continue
-        yield from _late(table["time_s"], f"{name}.csv has no rows", "")
+        yield from _pauses(table["time_s"], f"{name}.csv has no rows", "")
         for i in np.flatnonzero(np.diff(table["time_s"]) <= 0).tolist():
             at = float(table["time_s"][i])
             yield LogDefect(at, at, f"{name}.csv has two rows at one time")
     for name in run.telemetry or ():
         if name != "time_s":
-            yield from _late(readings(run, name)[0], f"{name} reports nothing", name)
+            yield from _pauses(readings(run, name)[0], f"{name} reports nothing", name)
 
 
-def _late(time: np.ndarray, what: str, column: str) -> Iterator[LogDefect]:
+def _pauses(time: np.ndarray, what: str, column: str) -> Iterator[LogDefect]:
+    """A defect for each step of time above `MISSED` periods."""
     every = period(time)
     for i in np.flatnonzero(np.diff(time) > MISSED * every).tolist():
         start, end = float(time[i]), float(time[i + 1])
@@ -179,7 +186,10 @@ def _late(time: np.ndarray, what: str, column: str) -> Iterator[LogDefect]:
 
 
 def missing(run: Run) -> Iterator[LogDefect]:
-    """Columns that hold nothing, cells of motion capture that do not, and infinite values."""
+    """Empty columns, empty cells of motion capture, and infinite values.
+
+    Infinite sonar readings are no defect.
+    """
     for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
         if table is None or not len(table):
             continue
@@ -202,7 +212,7 @@ def missing(run: Run) -> Iterator[LogDefect]:
 
 
 def released(run: Run) -> Iterator[LogDefect]:
-    """While the dead-man switch is open, what was asked is not what the motor got."""
+    """Stretches with the dead-man switch open: the motor does not follow the throttle command."""
     time, armed = readings(run, "armed")
     for first, last in stretches(armed < 0.5):
         end = time[min(last + 1, len(time) - 1)]
@@ -215,7 +225,7 @@ def released(run: Run) -> Iterator[LogDefect]:
 
 
 def frames(truth: Table) -> tuple[np.ndarray, np.ndarray]:
-    """Times and poses, (3, frames), of the frames that hold one; times rise."""
+    """Rising times (frames,) and poses (3, frames) of the frames with a complete pose."""
     pose = np.stack([truth["x_m"], truth["y_m"], truth["heading_rad"]])
     good = np.all(np.isfinite(pose), axis=0)
     good[1:] &= np.diff(truth["time_s"]) > 0
@@ -223,13 +233,13 @@ def frames(truth: Table) -> tuple[np.ndarray, np.ndarray]:
 
 
 def usual(time: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Median of a step's rate over the steps around it."""
+    """Rolling median of rates over `AROUND` seconds, or 7 rates if those are more."""
     width = 2 * max(3, round(AROUND / 2 / max(float(np.median(np.diff(time))), 1e-4))) + 1
     return median_filter(rates, width, mode="nearest")
 
 
 def repeated_frames(truth: Table) -> Iterator[LogDefect]:
-    """Frames that are the one before, though the car moves."""
+    """Frames that repeat the previous frame while the car moves."""
     time, pose = frames(truth)
     if len(time) < ROWS:
         return
@@ -241,7 +251,11 @@ def repeated_frames(truth: Table) -> Iterator[LogDefect]:
 
 
 def false_frames(time: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Frames off the median of the five around them by more than any acceleration explains."""
+    """True for frames too far off the median of the five frames around them: (frames,).
+
+    The limit in position is `SLACK` + `MARGIN` `BEST_FRICTION` g h² / 2, with h two periods. The
+    limit in heading is `SLACK_YAW` + `ABRUPT_YAW` h / 2.
+    """
     reach = 2 * float(np.median(np.diff(time)))
     limit = SLACK + MARGIN * BEST_FRICTION * GRAVITY * reach**2 / 2
     limit_yaw = SLACK_YAW + ABRUPT_YAW * reach / 2
@@ -251,7 +265,7 @@ def false_frames(time: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def jumps(truth: Table) -> Iterator[LogDefect]:
-    """Frames that the car cannot have been at, or cannot have come to."""
+    """False frames, and steps from one frame to the next that are too large for a car."""
     time, pose = frames(truth)
     if len(time) < ROWS:
         return
@@ -264,14 +278,14 @@ def jumps(truth: Table) -> Iterator[LogDefect]:
     moved, turned = np.hypot(*np.diff(pose[:2], axis=1)), np.abs(np.diff(pose[2]))
     speed, rate = usual(time, moved / span), usual(time, turned / span)
     far = moved > SLACK + (speed + ABRUPT) * span
-    round_ = turned > SLACK_YAW + (rate + ABRUPT_YAW) * span
-    for i in np.flatnonzero(far | round_).tolist():
+    spun = turned > SLACK_YAW + (rate + ABRUPT_YAW) * span
+    for i in np.flatnonzero(far | spun).tolist():
         by = f"{moved[i]:.2f} m" if far[i] else f"{math.degrees(turned[i]):.0f}°"
         yield LogDefect(float(time[i]), float(time[i + 1]), f"motion capture jumps by {by}")
 
 
 def false_yaw_rates(truth: Table) -> Iterator[LogDefect]:
-    """Yaw rates that are not how the heading changes, before nor after."""
+    """Yaw rates off the heading's rate by `FALSE_YAW_RATE`, both before and after the row."""
     if "yaw_rate_radps" not in truth or len(truth) < ROWS:
         return
     time, rate = truth["time_s"], truth["yaw_rate_radps"]
@@ -287,7 +301,10 @@ def false_yaw_rates(truth: Table) -> Iterator[LogDefect]:
 
 
 def follow(truth: Table) -> Track | None:
-    """Velocities from motion capture; None where it is too short."""
+    """Velocities from motion capture, as recorded or else differenced from poses.
+
+    None if fewer than `ROWS` frames are usable.
+    """
     time, pose = frames(truth)
     if len(time) < ROWS:
         return None
@@ -319,7 +336,10 @@ def follow(truth: Table) -> Track | None:
 
 
 def hardest(run: Run) -> float:
-    """Acceleration that is beyond the car's tyres (m/s²)."""
+    """Largest acceleration by the tyres (m/s²): `MARGIN` g times their peak friction.
+
+    The friction is that of the run's car if known, and at least `BEST_FRICTION`.
+    """
     friction = BEST_FRICTION
     if run.car is not None:
         tires = run.car.tires
@@ -328,7 +348,7 @@ def hardest(run: Run) -> float:
 
 
 def collisions(run: Run, track: Track | None) -> Iterator[LogDefect]:
-    """Where the velocity changes faster than tyres can change it."""
+    """Stretches in which the velocity changes by more than `hardest` over the track's span."""
     if track is None:
         return
     time = track.time
@@ -337,17 +357,19 @@ def collisions(run: Run, track: Track | None) -> Iterator[LogDefect]:
     change = np.hypot(
         *(values[step:] - values[:-step] for values in (track.east, track.north))
     ) / np.maximum(span, track.span)
-    # Beside a gap nothing can be said, and nothing beside a jump of the poses.
+    # Next to a gap or a jump of the poses, a change of velocity is no evidence.
     hit = (change > hardest(run)) & (span < 1.5 * max(track.span, float(np.median(span))))
     if run.truth is not None:
         for fault in jumps(run.truth):
             reach = track.span
             hit &= (time[step:] < fault.start - reach) | (time[:-step] > fault.end + reach)
-    yield from _hits(time[:-step], time[step:], change, hit, "the car is slowed or thrown by")
+    yield from _merged_hits(
+        time[:-step], time[step:], change, hit, "the car is slowed or thrown by"
+    )
 
 
 def impacts(run: Run) -> Iterator[LogDefect]:
-    """The same from a fast accelerometer, where there is no motion capture."""
+    """Collisions by an accelerometer of `IMPACT_RATE` or more, for runs without motion capture."""
     time, ax = readings(run, "accel_x_mps2")
     other, ay = readings(run, "accel_y_mps2")
     if not np.array_equal(time, other) or not period(time) <= 1 / IMPACT_RATE:
@@ -356,13 +378,13 @@ def impacts(run: Run) -> Iterator[LogDefect]:
     noise = 1.4826 * np.median(np.abs(np.diff([ax, ay]))) / math.sqrt(2)
     size = np.hypot(ax, ay)
     hit = size > hardest(run) + QUIET * noise
-    yield from _hits(time, time, size, hit, "the accelerometer reads")
+    yield from _merged_hits(time, time, size, hit, "the accelerometer reads")
 
 
-def _hits(
+def _merged_hits(
     begin: np.ndarray, end: np.ndarray, size: np.ndarray, hit: np.ndarray, what: str
 ) -> Iterator[LogDefect]:
-    """Hits that are closer than their own length are one."""
+    """A defect for each hit, extended by `BEFORE` and `AFTER`. Overlapping hits are merged."""
     found: list[tuple[float, float, float]] = []
     for first, last in stretches(hit):
         start, stop = float(begin[first]) - BEFORE, float(end[last]) + AFTER
@@ -382,19 +404,19 @@ def _hits(
 
 
 def held(time: np.ndarray, values: np.ndarray, least: float) -> Iterator[tuple[int, int]]:
-    """First and last reading of each stretch of one value that lasts so long (s)."""
+    """First and last index of each stretch of equal readings of at least `least` seconds."""
     for first, last in stretches(np.diff(values) == 0):
         if time[last + 1] - time[first] >= least and last + 2 - first >= READINGS:
             yield first, last + 1
 
 
 def longest(time: np.ndarray, where: np.ndarray) -> float:
-    """Duration of the longest stretch that is so throughout (s)."""
+    """Duration of the longest stretch of True (s)."""
     return max((float(time[b] - time[a]) for a, b in stretches(where)), default=0.0)
 
 
 def stuck_encoder(run: Run, track: Track | None) -> Iterator[LogDefect]:
-    """A wheel speed that stays the same though drive and motion say that it cannot."""
+    """Stretches of constant wheel speed that contradict the throttle or the motion."""
     time, speed = readings(run, "wheel_speed_mps")
     if len(time) < ROWS:
         return
@@ -406,11 +428,11 @@ def stuck_encoder(run: Run, track: Track | None) -> Iterator[LogDefect]:
         throttle = asked(run, "throttle", at)
         idle = throttle == 0
         early, late = (np.mean(half) for half in np.array_split(throttle, 2))
-        other = abs(late - early) > 0.2 and min(early, late) < FULL
+        throttle_changes = abs(late - early) > 0.2 and min(early, late) < FULL
         why = ""
         if value > 0 and longest(at, idle) >= HELD_ALONE:
             why = "without throttle"
-        elif value > 0 and other and at[-1] - at[0] >= HELD_ALONE:
+        elif value > 0 and throttle_changes and at[-1] - at[0] >= HELD_ALONE:
             why = "whatever the throttle"
         elif track is not None:
             vx = track.at(track.vx, at)
@@ -431,53 +453,58 @@ def stuck_encoder(run: Run, track: Track | None) -> Iterator[LogDefect]:
 
 
 def stuck_gyroscope(run: Run, track: Track | None) -> Iterator[LogDefect]:
-    """A yaw rate that stays the same though the car turns otherwise. At its reach it may."""
+    """Stretches of constant yaw rate that contradict the car's turning.
+
+    A saturated gyroscope is no defect: its reading stays constant while the car turns faster.
+    """
     time, rate = readings(run, "gyro_radps")
     if len(time) < ROWS:
         return
-    most = float(np.max(np.abs(rate)))
+    largest = float(np.max(np.abs(rate)))
     wheel_time, wheel = readings(run, "wheel_speed_mps")
     for first, last in held(time, rate, HELD):
         at, value = time[first : last + 1], float(rate[first])
-        full = abs(value) >= 0.99 * most and most > 2
+        saturated = abs(value) >= 0.99 * largest and largest > 2
         if track is not None:
             true = track.at(track.yaw_rate, at)
             false = np.abs(true - value) > TURNS
-            if full:
+            if saturated:
                 false &= np.abs(true) < abs(value)
             stuck = longest(at, false) >= HELD
         else:
             steering = asked(run, "steering", at)
             moving = np.interp(at, wheel_time, wheel) > APART if len(wheel) else np.zeros(len(at))
-            answers = np.ptp(steering) > STEERED or (
+            should_turn = np.ptp(steering) > STEERED or (
                 np.min(np.abs(steering)) > STEERED and abs(value) < SLACK_YAW
             )
-            long = at[-1] - at[0] >= HELD_ALONE
-            stuck = bool(long and np.all(moving) and answers and not full)
+            lasting = at[-1] - at[0] >= HELD_ALONE
+            stuck = bool(lasting and np.all(moving) and should_turn and not saturated)
         if stuck:
             what = f"the gyroscope stays at {value:.2f} rad/s while the car turns otherwise: stuck"
             yield LogDefect(float(at[0]), float(at[-1]), what, "gyro_radps")
 
 
 # -------------------------------------------------------------------------------------------------
-# What cannot be used
+# Refusals
 # -------------------------------------------------------------------------------------------------
 
 
 def refuse(run: Run) -> None:
-    """Raise `InputError`, naming file and time, for what no masking can save."""
+    """Raise `InputError` with file and time for errors that masking a stretch cannot remove."""
     for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
         if table is not None:
             _refuse_table(f"{run.path}/{name}.csv", table)
     commands = f"{run.path}/commands.csv"
-    _none(commands, run.commands, ~np.isfinite(run.commands["throttle"]), "throttle is no number")
-    _none(
+    _require_none(
+        commands, run.commands, ~np.isfinite(run.commands["throttle"]), "throttle is no number"
+    )
+    _require_none(
         commands,
         run.commands,
         np.abs(run.commands["throttle"]) > 1,
         "throttle is beyond 1: is it in percent?",
     )
-    _none(
+    _require_none(
         commands,
         run.commands,
         np.abs(run.commands["steering"]) > STEEPEST,
@@ -488,17 +515,19 @@ def refuse(run: Run) -> None:
     _refuse_sensors(run)
 
 
-def _none(file: str, table: Table, wrong: np.ndarray, message: str) -> None:
+def _require_none(file: str, table: Table, wrong: np.ndarray, message: str) -> None:
+    """Raise `InputError` for the first row of the mask `wrong`, if any."""
     if np.any(wrong):
         raise InputError(f"{file}, {table['time_s'][np.argmax(wrong)]:.2f} s: {message}")
 
 
 def _refuse_table(file: str, table: Table) -> None:
+    """Refuse a table without rows, or with a false clock."""
     if not len(table):
         raise InputError(f"{file}: holds no rows")
     time = table["time_s"]
-    _none(file, table, ~np.isfinite(time), "time_s is no number")
-    _none(file, table, np.diff(time, prepend=time[0]) < 0, "time_s goes backwards")
+    _require_none(file, table, ~np.isfinite(time), "time_s is no number")
+    _require_none(file, table, np.diff(time, prepend=time[0]) < 0, "time_s goes backwards")
     if len(time) >= ROWS and np.median(np.diff(time)) >= SLOWEST_CLOCK:
         step = float(np.median(np.diff(time)))
         raise InputError(
@@ -507,7 +536,10 @@ def _refuse_table(file: str, table: Table) -> None:
 
 
 def _refuse_truth(run: Run, truth: Table) -> None:
-    """Units of motion capture: of poses by how fast they go, of the rest by the poses."""
+    """Refuse motion capture without poses or in other units than its columns name.
+
+    Poses are judged by their speed, the other columns by the poses.
+    """
     file = f"{run.path}/truth.csv"
     for name in ("x_m", "y_m", "heading_rad"):
         if not np.any(np.isfinite(truth[name])):
@@ -516,7 +548,7 @@ def _refuse_truth(run: Run, truth: Table) -> None:
     if len(time) < ROWS:
         return
     span = np.diff(time)
-    # The same over a tenth of a second tells a course, where frames are noise.
+    # Over a tenth of a second, poses give a course. From frame to frame, they give noise.
     stride = max(1, round(0.1 / float(np.median(span))))
     east, north, turned = (line[stride:] - line[:-stride] for line in pose)
     over = time[stride:] - time[:-stride]
@@ -530,10 +562,10 @@ def _refuse_truth(run: Run, truth: Table) -> None:
     begins = time[:-stride]
     course = np.arctan2(north, east)
     bend = np.angle(np.exp(1j * (course[stride:] - course[:-stride])))
-    told = moving[stride:] & moving[:-stride] & (np.abs(bend) > 0.05)
-    _no_degrees(file, "heading_rad", begins[stride:], turned[stride:], bend, told)
+    curved = moving[stride:] & moving[:-stride] & (np.abs(bend) > 0.05)
+    _refuse_degrees(file, "heading_rad", begins[stride:], turned[stride:], bend, curved)
     rate = np.abs(turned) / over
-    if np.quantile(rate, 0.9) > FASTEST_YAW:  # of a car that spins, where the course tells little
+    if np.quantile(rate, 0.9) > FASTEST_YAW:  # for a spinning car: it has no reliable course
         at = float(begins[np.argmax(rate > FASTEST_YAW)])
         message = f"heading_rad turns at over {FASTEST_YAW:g} rad/s: in degrees?"
         raise InputError(f"{file}, {at:.2f} s: {message}")
@@ -541,17 +573,17 @@ def _refuse_truth(run: Run, truth: Table) -> None:
     if "yaw_rate_radps" in truth:
         rate = np.interp(middle, truth["time_s"], truth["yaw_rate_radps"])
         slope = np.angle(np.exp(1j * turned)) / over
-        _no_degrees(file, "yaw_rate_radps", begins, rate, slope, np.abs(slope) > 0.3)
+        _refuse_degrees(file, "yaw_rate_radps", begins, rate, slope, np.abs(slope) > 0.3)
     if {"vx_mps", "vy_mps"} <= truth.keys():
         size = np.hypot(truth["vx_mps"], truth["vy_mps"])
         size = np.interp(middle, truth["time_s"], size)
-        _no_other_speed(file, "vx_mps, vy_mps", begins, size, speed, speed > 2 * STANDS)
+        _refuse_other_units(file, "vx_mps, vy_mps", begins, size, speed, speed > 2 * STANDS)
 
 
 def _refuse_sensors(run: Run) -> None:
-    """Units of encoder and gyroscope: by motion capture, or by what no model car does."""
+    """Refuse an encoder or gyroscope in another unit, by motion capture or the limits of cars."""
     file = f"{run.path}/telemetry.csv"
-    track = follow(repair(run)[0].truth) if run.truth is not None and len(run.truth) else None  # type: ignore[arg-type]  # it has one as this run has
+    track = follow(repair(run)[0].truth) if run.truth is not None and len(run.truth) else None  # type: ignore[arg-type]  # `repair` keeps `truth`
     for name, limit in (("wheel_speed_mps", FASTEST), ("gyro_radps", FASTEST_YAW)):
         time, values = readings(run, name)
         beyond = np.abs(values) > limit
@@ -562,36 +594,38 @@ def _refuse_sensors(run: Run) -> None:
             continue
         if name == "gyro_radps":
             rate = track.at(track.yaw_rate, time)
-            _no_degrees(file, name, time, values, rate, np.abs(rate) > 0.3)
+            _refuse_degrees(file, name, time, values, rate, np.abs(rate) > 0.3)
         else:
             vx, vy = track.at(track.vx, time), track.at(track.vy, time)
             grips = (vx > 0.3) & (np.abs(vy) < 0.1 * vx)
-            _no_other_speed(file, name, time, values, vx, grips)
+            _refuse_other_units(file, name, time, values, vx, grips)
 
 
-def _ratio(values: np.ndarray, true: np.ndarray, told: np.ndarray) -> tuple[float, float] | None:
-    """Quartiles of how much larger a value is than it should be; None where that is not told."""
-    told = told & np.isfinite(values) & np.isfinite(true) & (true != 0)
-    if np.sum(told) < TELLING:
+def _ratio(values: np.ndarray, true: np.ndarray, usable: np.ndarray) -> tuple[float, float] | None:
+    """Quartiles of value / true value; None with fewer than `TELLING` usable samples."""
+    usable = usable & np.isfinite(values) & np.isfinite(true) & (true != 0)
+    if np.sum(usable) < TELLING:
         return None
-    low, high = np.quantile(values[told] / true[told], [0.25, 0.75])
+    low, high = np.quantile(values[usable] / true[usable], [0.25, 0.75])
     return float(low), float(high)
 
 
-def _no_degrees(
-    file: str, name: str, time: np.ndarray, values: np.ndarray, true: np.ndarray, told: np.ndarray
+def _refuse_degrees(
+    file: str, name: str, time: np.ndarray, values: np.ndarray, true: np.ndarray, usable: np.ndarray
 ) -> None:
-    found = _ratio(values, true, told)
+    """Refuse values that are in degrees, by their ratio to the true radians."""
+    found = _ratio(values, true, usable)
     if found and DEGREES[0] < found[0] and found[1] < DEGREES[1]:
-        at = float(time[np.argmax(told)])
+        at = float(time[np.argmax(usable)])
         raise InputError(f"{file}, {at:.2f} s: {name} is some 57 times what is so: in degrees?")
 
 
-def _no_other_speed(
-    file: str, name: str, time: np.ndarray, values: np.ndarray, true: np.ndarray, told: np.ndarray
+def _refuse_other_units(
+    file: str, name: str, time: np.ndarray, values: np.ndarray, true: np.ndarray, usable: np.ndarray
 ) -> None:
-    found = _ratio(values, true, told)
+    """Refuse speeds in one of `UNITS`, by their ratio to the true m/s."""
+    found = _ratio(values, true, usable)
     for unit, (low, high) in UNITS.items():
         if found and low < found[0] and found[1] < high:
-            at = float(time[np.argmax(told)])
+            at = float(time[np.argmax(usable)])
             raise InputError(f"{file}, {at:.2f} s: {name} is in {unit}, by the positions")

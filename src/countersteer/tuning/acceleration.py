@@ -1,23 +1,32 @@
-"""The paper's own adjuster: steps of throttle from rest, until the simulated car keeps up.
+"""Fit the motor's resistance to steps of throttle from rest: the paper's `SimulatorAdjuster`.
 
-Log and simulator run side by side on the same commands, and one parameter of acceleration is
-changed until they agree. That parameter is `motor.resistance` R: the force at standstill is
-d U k n e / (r (R + d² R_battery)) for every duty d, and the no-load speed d U / (k n) has no R in
-it. So it scales how hard the car pulls at every throttle, and neither how fast it can get nor what
-resists it.
+Log and simulator run on the same commands. `motor.resistance` R is changed until their speeds
+agree. R alone is fitted, because it scales the acceleration at every throttle. With
+`motor.conduction` 1,
 
-Each level's log is compared over the first second of its throttle,
+    force at standstill = d U k n e / (r (R + d² R_battery))
+    no-load speed of the wheels = d U / (k n)
 
-    speed(t_i) = mean over the reader's window about t_i of v(t - late; R) + e_i,
+d is the duty, U the battery's open-circuit voltage, k the torque constant, n the gear ratio, e the
+efficiency and r the tyre radius. So R changes neither the no-load speed nor the drag.
 
-v by `planar.move`, straight, from rest, and e_i of the deviation that the reader states. A row
-tells when the command came to within its period only, so that `late` of each level is fitted too,
-within that period about 0, half of it as its deviation; it matters at 10 Hz, and not at 100.
+Each log holds one level of throttle. Its first second is compared:
 
-The cost is Huber's of all e_i, in units of their spread. It is descended in log R by Gauss and
-Newton's steps with the exact derivative of the simulator, halved until the cost falls. With one
-parameter that is gradient descent whose step is the curvature's, so that there is no rate to choose
-and a handful of simulations do. The derivative comes with the simulation, in the same program.
+    speed(t_i) = mean of v(t - late; R) over the reader's window about t_i, + e_i
+
+v is the speed of the simulated car (`planar.move`), straight and from rest. The reader of the speed
+gives the standard deviation of e_i.
+
+A row gives the time of its command only to within one row period. So `late` is fitted for each
+level, within one period of 0. Its prior standard deviation is half a period. This matters at
+10 Hz and does not matter at 100 Hz.
+
+The cost is the Huber loss of all e_i, in units of their spread. It is minimised over log R by
+Gauss-Newton steps with the exact derivative of the simulator. A step is halved until the cost
+falls. With one parameter, this is gradient descent with a step size from the curvature. It needs no
+learning rate and only a handful of simulations. One program computes speed and derivative.
+
+Source: "Autonomous RC Car Drifting", the paper that the project started from.
 """
 
 import math
@@ -42,50 +51,51 @@ from countersteer.tuning.windows import asked
 from countersteer.world import drivetrain, planar
 
 PARAMETER = "motor.resistance"
-DURATION = 1.0  # s of each step, the paper's
-PRECISION = 1e-3  # part of the parameter; its standard deviation is several times that
+DURATION = 1.0  # s of each step, as in the paper
+PRECISION = 1e-3  # relative change of R that ends the fit; R's deviation is several times larger
 
 DT = 0.005  # s; speeds are within 2e-4 m/s of those at 1 ms
-AFTER = 0.2  # s simulated beyond the second, so that a car may be late or early
-LANES = 16  # levels simulated at once, always as many: one program
+AFTER = 0.2  # s simulated beyond `DURATION`, so that a car may be late or early
+LANES = 16  # levels in every simulation; with a fixed number, one program is compiled
 
-# What is a step
-SETTLES = 0.2  # s in which a hand has moved the throttle to its level
-SAME = 0.02  # throttle that hands and filters differ by from one row to the next
-LEAST = 0.4  # s that a level must be held
-STRAIGHT = math.radians(5)
-STILL = 0.1  # m/s before the onset
-MOVED = 0.03  # m in a second: less is play, or an encoder's first count
-FEWEST = 3  # readings; two tell speed and lateness but not that they do
+# Detection of a step
+SETTLES = 0.2  # s after the onset; by then a hand has moved the throttle to the level
+SAME = 0.02  # throttle; hands and filters change a held level by less from row to row
+LEAST = 0.4  # s, shortest hold of a level
+STRAIGHT = math.radians(5)  # steering; beyond it, a step is not straight
+STILL = 0.1  # m/s before the onset; above it, the car rolls
+MOVED = 0.03  # m in a second; less may be play, or an encoder's first count
+FEWEST = 3  # readings; two would fix speed and lateness, with none left to check them
 
-HUBER = 1.345  # spreads beyond which an error counts by its size: 95 % efficient if all is normal
-# Median error of a run that belongs to another car, or to a sensor that is stuck: in those of all
-# readings, and over the run's mean speed. A car that is only modelled badly has the first alone.
+HUBER = 1.345  # spreads at which the loss turns linear: 95 % efficient for normal errors
+# Limits of a run's median error, relative to that of all readings and to the run's mean speed.
+# Beyond both, the run is of another car, or its sensor is stuck. A poor model exceeds the first
+# alone.
 FOREIGN, FOREIGN_PART = 3.0, 0.3
 LONGEST_STEP = 0.7  # of log R: a factor of two
-ROUNDS = 40  # of descent; it takes five
+ROUNDS = 40  # simulations at most; the search takes five
 
 NEVER_MOVES = "the car does not move: under the dead zone, it tells nothing of acceleration"
 SENSORS = {"encoder": "wheel_speed_mps", "sonar": "sonar_front_m", "lines": "line_crossings"}
 
 
 class Series(NamedTuple):
-    """One level: speed from its onset on, measured and simulated."""
+    """Measured and simulated speed at one level, from the onset of the throttle."""
 
     path: Path
     level: float  # throttle
-    time: np.ndarray  # s since the throttle came
+    time: np.ndarray  # s after the onset
     measured: np.ndarray  # m/s
-    deviation: np.ndarray  # m/s, the reader's
-    before: np.ndarray  # m/s, simulated with the car as it was
+    deviation: np.ndarray  # m/s, standard deviation from the reader
+    before: np.ndarray  # m/s, simulated with the original car
     after: np.ndarray  # m/s, simulated with the fitted car
-    late: float  # s by which the car answers later than its rows say
+    late: float  # s, lateness of the car after the row of the command
     rms_before: float  # m/s
     rms_after: float
 
 
 class Unused(NamedTuple):
-    """A run that took no part."""
+    """A run that the fit does not use."""
 
     path: Path
     level: float  # throttle; NaN where there is none
@@ -93,41 +103,41 @@ class Unused(NamedTuple):
 
 
 class Acceleration(NamedTuple):
-    """What came of a fit."""
+    """The result of a fit."""
 
     car: Car
-    parameter: str  # path of what was fitted
-    before: float
+    parameter: str  # path of the fitted parameter
+    before: float  # value of the parameter
     after: float
     deviation: float  # one standard deviation of `after`
     rms_before: float  # m/s, over all readings
     rms_after: float
-    source: str  # of the measured speed
-    iterations: int
-    converged: bool  # to the precision asked for
-    at_bound: bool  # of the parameter's declared range
+    source: str  # reader of the measured speed
+    iterations: int  # simulations
+    converged: bool  # to the requested precision
+    at_bound: bool  # the parameter is at a bound of its declared range
     series: tuple[Series, ...]  # by level
     unused: tuple[Unused, ...]
-    masked: tuple[str, ...]  # a line for each stretch that was left out
+    masked: tuple[str, ...]  # a line for each excluded stretch
 
 
 class Step(NamedTuple):
-    """A run's step of throttle as the simulator needs it, and what was measured in it."""
+    """A run's step of throttle: the simulator's inputs and the measured speed."""
 
     path: Path
     level: float
-    commands: Table  # throttle that the motor got
+    commands: Table  # with the throttle at the motor
     onset: float  # s
-    charge: float
+    charge: float  # of the battery, 0 to 1
     row: float  # s between two commands
-    time: np.ndarray  # s since the onset; the middle of each reading
-    over: np.ndarray  # s
-    speed: np.ndarray  # m/s, positive the way the throttle pushes
-    deviation: np.ndarray
+    time: np.ndarray  # s after the onset, at the middle of each reading
+    over: np.ndarray  # s, averaging time of each reading
+    speed: np.ndarray  # m/s, positive in the direction of the throttle
+    deviation: np.ndarray  # m/s
 
 
 class UnusableError(Exception):
-    """Why a run cannot be used; its level if it has one."""
+    """The reason why a run is unusable, with its level (NaN: none)."""
 
     def __init__(self, reason: str, level: float = math.nan) -> None:
         super().__init__(reason)
@@ -137,16 +147,18 @@ class UnusableError(Exception):
 def fit_acceleration(
     runs: Sequence[Run], car: Car, source: str = "encoder", precision: float = PRECISION
 ) -> Acceleration:
-    """The car with its `motor.resistance` so that it accelerates as it did in `runs`.
+    """Fit `motor.resistance` R so that the car accelerates as in `runs`.
 
-    `source` of the speed is `encoder`, `sonar` or `lines`. It ends where R changes by less than the
-    part `precision`. Its standard deviation is the larger of that by the curvature and that by how
-    much runs contradict each other. Runs that tell nothing or are false are named in `unused`,
-    stretches that `faults` finds are left out and named in `masked`.
+    `source` is the reader of the speed: `encoder`, `sonar` or `lines`. The fit ends when R changes
+    by less than the fraction `precision`. R's standard deviation is the larger of two: from the
+    curvature of the cost, and from the disagreement between runs.
 
-    Raises `InputError` where no run can be used.
+    `unused` lists runs that are false or have no usable step. Stretches of `find_defects` are left
+    out and listed in `masked`.
+
+    Raises `InputError` if `source` is unknown or no run is usable.
     """
-    steps, unused, masked = _take_all(runs, source)
+    steps, unused, masked = _collect_steps(runs, source)
     with jax.enable_x64(True):
         first = _Fit(car, source, steps)
         best, iterations, converged = _descend(first, precision)
@@ -198,12 +210,12 @@ def _rms(errors: np.ndarray) -> float:
 
 
 # -------------------------------------------------------------------------------------------------
-# What was measured
+# Measurement
 # -------------------------------------------------------------------------------------------------
 
 
-def _take_all(runs: Sequence[Run], source: str) -> tuple[list[Step], list[Unused], list[str]]:
-    """The steps that can be used; the runs that cannot; and what of the steps was left out."""
+def _collect_steps(runs: Sequence[Run], source: str) -> tuple[list[Step], list[Unused], list[str]]:
+    """The usable steps, the unusable runs, and a line for each excluded stretch."""
     if source not in SENSORS:
         raise InputError(f"no reader of speed {source}: give one of {', '.join(SENSORS)}")
     steps: list[Step] = []
@@ -220,9 +232,9 @@ def _take_all(runs: Sequence[Run], source: str) -> tuple[list[Step], list[Unused
             steps.append(step)
             masked += lines
     for i, (path, level, reason) in enumerate(unused):
-        less = [abs(s.level) for s in steps if 0 < s.level / level < 1]  # none where it is NaN
-        if reason == NEVER_MOVES and less:
-            reason = f"{source} tells no motion, though the car moves at {min(less):g}: stuck?"
+        lower = [abs(s.level) for s in steps if 0 < s.level / level < 1]  # none if NaN
+        if reason == NEVER_MOVES and lower:
+            reason = f"{source} tells no motion, though the car moves at {min(lower):g}: stuck?"
             unused[i] = Unused(path, level, reason)
     if not steps:
         reasons = "; ".join(f"{path.name}: {reason}" for path, _, reason in unused[:1])
@@ -231,16 +243,16 @@ def _take_all(runs: Sequence[Run], source: str) -> tuple[list[Step], list[Unused
 
 
 def take(run: Run, source: str) -> tuple[Step, list[str]]:
-    """The run's first step of throttle from rest, and a line for each stretch that is false in it.
+    """The run's first step of throttle from rest, and a line for each false stretch in it.
 
-    Raises `UnusableError` where it has none that can be used, `InputError` where it is false.
+    Raises `UnusableError` if the run has no usable step, and `InputError` if its data are false.
     """
     stretches = defects.find_defects(run)
-    commands = _driven(run)
-    onset, end, level = _held(run, commands, source)
-    told = defects.readings(run, SENSORS[source])[1]
-    # A detector reports when it meets a line: a sensor that is there, and nothing, is no motion.
-    if SENSORS[source] in (run.telemetry or {}) and source != "sonar" and not np.any(told):
+    commands = _motor_commands(run)
+    onset, end, level = _find_step(run, commands, source)
+    reports = defects.readings(run, SENSORS[source])[1]
+    # A line detector reports only at a line. A column without one, or of zeros, is no motion.
+    if SENSORS[source] in (run.telemetry or {}) and source != "sonar" and not np.any(reports):
         raise UnusableError(NEVER_MOVES, level)
     speed = read_speed(run, source)
     inside = (speed.time + speed.over / 2 > onset) & (speed.time + speed.over / 2 <= end + 1e-6)
@@ -258,7 +270,7 @@ def take(run: Run, source: str) -> tuple[Step, list[str]]:
         reason = lines[0] if lines else f"only {len(time)} readings of its {source} in the step"
         raise UnusableError(reason, level)
     if source == "sonar":
-        value = value * np.sign(level)  # the others do not tell forward from backward
+        value = value * np.sign(level)  # the other readers give no sign
     if np.sum(value * over) / np.sum(over) * DURATION < MOVED:
         raise UnusableError(NEVER_MOVES, level)
     rows = np.diff(commands["time_s"])
@@ -270,8 +282,8 @@ def take(run: Run, source: str) -> tuple[Step, list[str]]:
     )
 
 
-def _driven(run: Run) -> Table:
-    """The commands with the throttle that the motor got: none while the dead-man switch is open."""
+def _motor_commands(run: Run) -> Table:
+    """The commands with the throttle at the motor: 0 while the dead-man switch is open."""
     time = run.commands["time_s"]
     at, armed = defects.readings(run, "armed")
     throttle = defects.asked(run, "throttle", time)
@@ -286,116 +298,122 @@ def _driven(run: Run) -> Table:
     )
 
 
-def _held(run: Run, commands: Table, source: str) -> tuple[float, float, float]:
-    """Begin and end (s) of the first throttle that is held from rest, and its level."""
+def _find_step(run: Run, commands: Table, source: str) -> tuple[float, float, float]:
+    """Onset (s), end (s) and level of the first throttle that is held straight from rest.
+
+    Raises `UnusableError` if there is none.
+    """
     time, throttle = commands["time_s"], commands["throttle"]
-    # The last row stands until the log ends.
+    # The last command holds until the log ends.
     last = max(float(t["time_s"][-1]) for t in (commands, run.telemetry) if t is not None)
     reason, level = "there is no throttle in it", math.nan
     for i in np.flatnonzero((throttle != 0) & (np.append(0.0, throttle[:-1]) == 0)):
         onset = float(time[i])
         level = float(throttle[np.searchsorted(time, onset + SETTLES, side="right") - 1])
-        left = (time > onset + SETTLES) & (np.abs(throttle - level) > SAME)
-        end = min(onset + DURATION, float(time[left][0]) if np.any(left) else last)
+        changes = (time > onset + SETTLES) & (np.abs(throttle - level) > SAME)
+        end = min(onset + DURATION, float(time[changes][0]) if np.any(changes) else last)
         steered = np.abs(commands["steering"][(time >= onset) & (time < end)])
         if level == 0 or end - onset < LEAST:
             reason = f"no throttle is held for {LEAST:g} s"
         elif np.max(steered) > STRAIGHT:
             reason = f"it is not straight: steering goes to {math.degrees(np.max(steered)):.0f}°"
-        elif _rolls(run, source, onset):
+        elif _moves_before(run, source, onset):
             reason = "the car rolls before the throttle comes"
         else:
             return onset, end, level
     raise UnusableError(reason, level)
 
 
-def _rolls(run: Run, source: str, onset: float) -> bool:
-    """Whether the car moves in the half second before."""
+def _moves_before(run: Run, source: str, onset: float) -> bool:
+    """True if the car moves in the half second before the onset."""
     at, value = defects.readings(run, SENSORS[source])
-    just = (at > onset - 0.5) & (at <= onset)
-    if np.sum(just) < FEWEST:
+    recent = (at > onset - 0.5) & (at <= onset)
+    if np.sum(recent) < FEWEST:
         return False
     if source == "encoder":
-        return bool(np.median(value[just]) > STILL)
-    heard = value[just][np.isfinite(value[just])]
-    moved = abs(heard[-1] - heard[0]) if len(heard) > 1 else 0.0
+        return bool(np.median(value[recent]) > STILL)
+    finite = value[recent][np.isfinite(value[recent])]
+    moved = abs(finite[-1] - finite[0]) if len(finite) > 1 else 0.0
     return bool(moved > (1.5 if source == "lines" else 0.5 * STILL + MOVED))
 
 
 # -------------------------------------------------------------------------------------------------
-# What is simulated
+# Simulation
 # -------------------------------------------------------------------------------------------------
 
 
 class Curve(NamedTuple):
-    """How far a simulated car has come (m) at each tick, and how that changes with log R."""
+    """Distance of a simulated car (m) at each tick, and its derivative over log R."""
 
     distance: np.ndarray
     slope: np.ndarray
 
     def mean(self, line: np.ndarray, time: np.ndarray, over: np.ndarray) -> np.ndarray:
-        """Mean rate of a line of the curve over windows about these times."""
+        """Mean time derivative of `line` over windows, centred at `time` and `over` long (s)."""
         ticks = DT * np.arange(len(line))
         ends = (np.interp(time + side * over / 2, ticks, line) for side in (1, -1))
         return np.subtract(*ends) / over
 
     def rate(self, time: np.ndarray, over: np.ndarray) -> np.ndarray:
-        """Mean acceleration over the windows."""
+        """Mean acceleration over the same windows (m/s²)."""
         ticks = DT * np.arange(len(self.distance) - 1)
         speed = np.diff(self.distance) / DT
         ends = (np.interp(time + side * over / 2 - DT / 2, ticks, speed) for side in (1, -1))
         return np.subtract(*ends) / over
 
 
-def _roll(car: Car, place: Scalar, source: str, steps: Sequence[Step]) -> list[Curve]:
-    """Simulate each step with log R at `place`."""
+def _simulate(car: Car, log_r: Scalar, source: str, steps: Sequence[Step]) -> list[Curve]:
+    """Simulate each step with R = exp(log_r)."""
     ticks = round((DURATION + AFTER) / DT)
     curves = []
     for begin in range(0, len(steps), LANES):
-        some = steps[begin : begin + LANES]
+        block = steps[begin : begin + LANES]
         throttle, charge = np.zeros((ticks, LANES)), np.ones(LANES)
-        for lane, step in enumerate(some):
+        for lane, step in enumerate(block):
             at = (step.onset - float(car.motor.delay)) / DT + np.arange(ticks)
             throttle[:, lane] = asked(step.commands, at, DT)[0]
             charge[lane] = step.charge
-        speeds, slopes = _speeds(car, np.float64(place), throttle, charge)
+        speeds, slopes = _speeds(car, np.float64(log_r), throttle, charge)
         which = int(source != "encoder")
-        for lane, step in enumerate(some):
-            lines = (_travelled(np.asarray(pair[which])[:, lane]) for pair in (speeds, slopes))
-            # Measured speeds are positive the way in which the throttle pushes.
+        for lane, step in enumerate(block):
+            lines = (_distance(np.asarray(pair[which])[:, lane]) for pair in (speeds, slopes))
+            # Curves are positive in the direction of the throttle, as measured speeds are.
             curves.append(Curve(*(math.copysign(1.0, step.level) * line for line in lines)))
     return curves
 
 
-def _travelled(speed: np.ndarray) -> np.ndarray:
-    """Distance at the begin of each tick for the speed at its end, from rest."""
+def _distance(speed: np.ndarray) -> np.ndarray:
+    """Distance by the trapezoidal rule, from rest; `speed` is at the end of each tick."""
     at = np.concatenate([[0.0], speed])
     return np.concatenate([[0.0], np.cumsum(at[1:] + at[:-1]) * DT / 2])
 
 
 @jax.jit
 def _speeds(
-    car: Car, place: Array, throttle: Array, charge: Array
+    car: Car, log_r: Array, throttle: Array, charge: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Speed of the encoder's rim and of the car after each tick, (ticks, lanes), and d/d log R."""
+    """Speeds after each tick (ticks, lanes), and their derivatives over log R.
+
+    Both are pairs: first the speed that the encoder measures, then the car's.
+    """
     no_walls = jnp.full((1, 4), jnp.nan)
 
-    def drive(place: Scalar) -> tuple[Array, Array]:
-        with_it = changed(car, PARAMETER, jnp.exp(place))
-        at_rest = jax.tree.map(jnp.asarray, planar.initial_state(with_it, DT, slots=1))
+    def drive(log_r: Scalar) -> tuple[Array, Array]:
+        adjusted = changed(car, PARAMETER, jnp.exp(log_r))
+        at_rest = jax.tree.map(jnp.asarray, planar.initial_state(adjusted, DT, slots=1))
 
         def begin(charge: Scalar) -> planar.State:
             return at_rest._replace(motion=at_rest.motion._replace(charge=charge))
 
         def tick(state: planar.State, throttle: Scalar) -> tuple[planar.State, tuple[Scalar, ...]]:
             command = Command(throttle, 0.0)
-            work = planar.Tick(with_it, no_walls, command, command, 0, DT)
+            work = planar.Tick(adjusted, no_walls, command, command, 0, DT)
             state, _ = planar.move(state, work)
-            return state, (_rim(with_it, state.motion.wheels), state.motion.vx)
+            return state, (_rim(adjusted, state.motion.wheels), state.motion.vx)
 
         return jax.lax.scan(jax.vmap(tick), jax.vmap(begin)(charge), throttle)[1]
 
-    return jax.jvp(drive, (place,), (jnp.ones_like(place),))
+    return jax.jvp(drive, (log_r,), (jnp.ones_like(log_r),))
 
 
 def _rim(car: Car, wheels: Wheels) -> Scalar:
@@ -406,43 +424,46 @@ def _rim(car: Car, wheels: Wheels) -> Scalar:
 
 
 # -------------------------------------------------------------------------------------------------
-# The descent
+# Descent
 # -------------------------------------------------------------------------------------------------
 
 
 class Level(NamedTuple):
-    """One level at one R."""
+    """One level simulated at one R, with its part of the cost's derivatives."""
 
     value: np.ndarray  # m/s, simulated
-    slope: np.ndarray  # of it over log R
+    slope: np.ndarray  # d value / d log R
     late: float  # s
     error: np.ndarray  # (measured - simulated) / deviation
-    weight: np.ndarray  # Huber's over deviation² and spread²
-    gradient: float  # of the cost, downhill
-    curvature: float  # with `late` eliminated
+    weight: np.ndarray  # Huber weight / (deviation² spread²)
+    gradient: float  # minus the derivative of the cost over log R
+    curvature: float  # of the cost over log R, with `late` eliminated
 
 
 class Point(NamedTuple):
     """All levels at one log R."""
 
     place: float
-    spread: float  # of the errors in the readers' deviations, at least 1
+    spread: float  # robust standard deviation of all `error`, at least 1
     levels: tuple[Level, ...]
-    priors: tuple[float, ...]  # the deviations of `late`
+    priors: tuple[float, ...]  # s, prior standard deviation of `late` at each level
 
     def cost(self, spread: float) -> float:
-        """Huber's, in units of that spread."""
+        """Sum of the Huber loss of error / `spread` and of (late / prior)² / 2."""
         errors = np.abs(np.concatenate([level.error for level in self.levels])) / spread
         close = np.minimum(errors, HUBER)
         late = [level.late / prior for level, prior in zip(self.levels, self.priors, strict=True)]
         return float(np.sum(close * errors - close**2 / 2) + np.sum(np.square(late)) / 2)
 
     def curvature(self) -> float:
-        """Of the cost over log R."""
+        """Second derivative of the cost over log R."""
         return sum(level.curvature for level in self.levels)
 
     def deviation(self) -> float:
-        """Of log R: by the curvature, or by the scatter of the runs' own gradients if larger."""
+        """Standard deviation of log R: the larger of two.
+
+        They are curvature^-½ and sqrt(sum of gradient² · m / (m - 1)) / curvature over m levels.
+        """
         curvature, count = self.curvature(), len(self.levels)
         variance = 1 / curvature if curvature > 0 else math.inf
         if count > 1 and curvature > 0:
@@ -460,13 +481,13 @@ class _Fit:
         self.low, self.high = declared.low, declared.high
         self.start = math.log(float(car.motor.resistance))
 
-    def at(self, place: float) -> Point:
-        """Simulate at log R = `place`; lateness, spread and weights are those that fit it best."""
-        curves = _roll(self.car, place, self.source, self.steps)
+    def at(self, log_r: float) -> Point:
+        """Simulate at `log_r`, with the lateness, spread and weights that fit best there."""
+        curves = _simulate(self.car, log_r, self.source, self.steps)
         priors = tuple(max(step.row / 2, DT / 2) for step in self.steps)
         lates, spread = [0.0] * len(curves), 1.0
         levels: list[Level] = []
-        for _ in range(4):  # lateness needs the weights, and these the errors at it
+        for _ in range(4):  # lateness depends on the weights, and they on lateness
             levels = [
                 _level(step, curve, late, prior, spread)
                 for step, curve, late, prior in zip(self.steps, curves, lates, priors, strict=True)
@@ -474,27 +495,31 @@ class _Fit:
             errors = np.concatenate([level.error for level in levels])
             spread = max(1.0, TO_DEVIATION * float(np.median(np.abs(errors))))
             lates = [
-                _later(step, curve, level, prior)
+                _improve_lateness(step, curve, level, prior)
                 for step, curve, level, prior in zip(
                     self.steps, curves, levels, priors, strict=True
                 )
             ]
-        return Point(place, spread, tuple(levels), priors)
+        return Point(log_r, spread, tuple(levels), priors)
 
     def foreign(self, point: Point) -> list[Unused]:
-        """Runs that no R brings near what the others agree on."""
-        usual = float(np.median(np.abs(np.concatenate([one.error for one in point.levels]))))
+        """Runs with errors beyond `FOREIGN` and `FOREIGN_PART` at this point.
+
+        Empty unless they are the minority.
+        """
+        typical = float(np.median(np.abs(np.concatenate([one.error for one in point.levels]))))
         found = []
         for step, level in zip(self.steps, point.levels, strict=True):
             off = float(np.median(np.abs(step.speed - level.value)))
-            unusual = np.median(np.abs(level.error)) > FOREIGN * max(usual, 1 / TO_DEVIATION)
-            if unusual and off > FOREIGN_PART * max(np.mean(step.speed), np.mean(level.value)):
+            outlying = np.median(np.abs(level.error)) > FOREIGN * max(typical, 1 / TO_DEVIATION)
+            if outlying and off > FOREIGN_PART * max(np.mean(step.speed), np.mean(level.value)):
                 reason = f"it is {off:.2f} m/s off the car that the other runs agree on"
                 found.append(Unused(step.path, step.level, reason))
         return found if 2 * len(found) < len(self.steps) else []
 
 
 def _level(step: Step, curve: Curve, late: float, prior: float, spread: float) -> Level:
+    """The errors of a step at this lateness, with the derivatives of the cost."""
     time = step.time - late
     value = curve.mean(curve.distance, time, step.over)
     slope = curve.mean(curve.slope, time, step.over)
@@ -510,8 +535,8 @@ def _level(step: Step, curve: Curve, late: float, prior: float, spread: float) -
     return Level(value, slope, late, error, weight, gradient, curvature)
 
 
-def _later(step: Step, curve: Curve, level: Level, prior: float) -> float:
-    """The lateness that fits a level better: one step of Gauss and Newton, within its range."""
+def _improve_lateness(step: Step, curve: Curve, level: Level, prior: float) -> float:
+    """A better lateness by one Gauss-Newton step, limited to two prior deviations."""
     rate = curve.rate(step.time - level.late, step.over)
     own = float(np.sum(level.weight * rate**2)) + prior**-2
     down = -float(np.sum(level.weight * rate * (step.speed - level.value))) - level.late / prior**2
@@ -519,22 +544,22 @@ def _later(step: Step, curve: Curve, level: Level, prior: float) -> float:
 
 
 def _descend(fit: _Fit, precision: float) -> tuple[Point, int, bool]:
-    """The lowest point, the simulations that it took, and whether it is as precise as asked."""
-    here, count = fit.at(fit.start), 1
-    while count < ROUNDS:
-        curvature = here.curvature()
+    """Minimise the cost: the best point, the number of simulations, and whether it converged."""
+    point, simulations = fit.at(fit.start), 1
+    while simulations < ROUNDS:
+        curvature = point.curvature()
         if curvature <= 0:
-            return here, count, False
-        step = sum(level.gradient for level in here.levels) / curvature
+            return point, simulations, False
+        step = sum(level.gradient for level in point.levels) / curvature
         step = float(np.clip(step, -LONGEST_STEP, LONGEST_STEP))
         while True:
-            place = float(np.clip(here.place + step, math.log(fit.low), math.log(fit.high)))
-            if abs(place - here.place) < precision:
-                return here, count, True
-            there = fit.at(place)
-            count += 1
-            if there.cost(here.spread) < here.cost(here.spread):
+            log_r = float(np.clip(point.place + step, math.log(fit.low), math.log(fit.high)))
+            if abs(log_r - point.place) < precision:
+                return point, simulations, True
+            candidate = fit.at(log_r)
+            simulations += 1
+            if candidate.cost(point.spread) < point.cost(point.spread):
                 break
             step /= 2
-        here = there
-    return here, count, False
+        point = candidate
+    return point, simulations, False

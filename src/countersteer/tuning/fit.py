@@ -1,17 +1,20 @@
-"""Logs in, a car out: robust least squares over windows of logs, with what can be believed of it.
+"""Fit a car's parameters to windows of logs by robust least squares, with their uncertainty.
 
     minimise  sum over windows, quantities, samples of rho(w (predicted - measured) / scale)
-              + sum over parameters of ((u - u_prior) / width)²
+              + sum over parameters of rho((u - u_prior) / width)
 
-where u is the logarithm of a parameter, or itself for one that may be nothing or less, and rho the
-soft L1 loss, so that a window in which the motion was caught at another instant counts no more than
-any. The weight w of a log of n windows is (n / median of n)^-½, so that logs count alike: a long
-one repeats a manoeuvre, and a brief one may be all there is of another. Derivatives are exact,
-through the simulator (`shooting.predict`); the search keeps the declared ranges (`Problem.solve`).
+u is the logarithm of a parameter. The parameters of `ABSOLUTE` may be zero or negative, so u is
+their value itself. rho is the soft L1 loss (`loss`). It limits the cost of outliers, such as a
+window whose motion was captured at another instant.
 
-The body and what drives it are shared by all logs; tyres and rolling drag are fitted for each
-surface by itself. How full the battery was belongs to a log: where it does not tell, that is
-fitted too, from a full one on.
+A log of n windows with s samples each has the weight w = (s n / median of n)^-½. So all logs have
+equal weight. A long log repeats a manoeuvre; a short one may be the only log of another.
+
+Derivatives are exact, through the simulator (`shooting.predict`). The search keeps the declared
+ranges (`Problem.solve`).
+
+All logs share body, motor and servo. Tyres and rolling drag are fitted for each surface. Battery
+charge is fitted for each log that does not state it. Its prior is a full battery.
 """
 
 import math
@@ -35,24 +38,24 @@ from countersteer.tuning import shooting
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import QUANTITIES
 
-STEP = 0.002  # s; the step's own error is then a hundredth of a log's
-HORIZON = 1.0  # s
-SCALES = np.array([0.05, 0.03, 0.12, 0.08])  # of the quantities: what a good fit is off by
-LOOSE = 0.5  # prior standard deviation of a logarithm, where there is none in `WIDTHS`
-LANES = 64  # windows in a call of the compiled program, whatever their number
-GROUP = 8  # derivatives that a lane takes at once
+STEP = 0.002  # s, of the simulation; its error is then a hundredth of a log's error
+HORIZON = 1.0  # s, length of a window
+SCALES = np.array([0.05, 0.03, 0.12, 0.08])  # of `QUANTITIES`, SI units: errors of a good fit
+LOOSE = 0.5  # prior standard deviation of a logarithm that is not in `WIDTHS`
+LANES = 64  # windows in every call of the compiled program; shorter blocks are padded
+GROUP = 8  # derivatives that one lane computes
 OUTLYING = 0.2  # normalised residual at which the loss turns linear
-GROSS = 0.5  # square of a residual beyond which it tells no more of the noise
-WILD = 1e3  # change of a residual per width of a parameter, from which nothing is linear
-TOLERANCE = 1e-5
-PASSES = 40  # steps of a search, at most
-DAMPING, EASY, STUCK = 0.01, 1e-6, 1e4  # of a step: at first, at the least, and in vain
-KNOWN = 0.9  # part of the prior's width under which a parameter counts as determined
-STRAIGHT = math.radians(4)  # steering under which a window is straight
-SLIDES = math.radians(10)  # sideslip from which it slides
-SPINS = 0.5  # m/s of wheel speed over the ground's from which it slides too
-HELD_OUT = 2.0  # s of each block that is fitted or held out by turns
-BRIEF = 10.0  # s of windows under which a log is a manoeuvre
+GROSS = 0.5  # upper limit of a squared residual in the estimate of the noise
+WILD = 1e3  # slope of a residual per prior width from which a window counts as chaotic
+TOLERANCE = 1e-5  # relative decrease of the cost at which a search ends
+PASSES = 40  # largest number of steps in a search
+DAMPING, EASY, STUCK = 0.01, 1e-6, 1e4  # of a step: first, least, and where a search gives up
+KNOWN = 0.9  # posterior over prior deviation; below it, a parameter is determined
+STRAIGHT = math.radians(4)  # steering; below it, a window is straight
+SLIDES = math.radians(10)  # sideslip; beyond it, a window slides
+SPINS = 0.5  # m/s of wheel speed above ground speed; beyond it, a window slides too
+HELD_OUT = 2.0  # s, length of a block; whole blocks are fitted or held out
+BRIEF = 10.0  # s; a log whose windows start within less is one manoeuvre
 
 ROLLING = ("drivetrain.drag", "drivetrain.drag_viscous")
 TIRES = (
@@ -67,7 +70,7 @@ TIRES = (
     "tires.front.longitudinal_ratio",
     "tires.rear.longitudinal_ratio",
 )
-FLOOR = (*TIRES, *ROLLING)  # fitted for each surface by itself
+FLOOR = (*TIRES, *ROLLING)  # fitted for each surface
 SPEEDS = (
     "motor.resistance",
     "motor.torque_constant",
@@ -92,11 +95,11 @@ STEERING = (
 )
 HANDLING = ("body.yaw_inertia", "body.front_roll_share")
 PARAMETERS = (*SPEEDS, *STEERING, *HANDLING, *TIRES)
-CHARGE = "battery.charge"  # no number of a car, but of a log
-FULL = 1.0  # charge that is expected of a log that does not tell
+CHARGE = "battery.charge"  # belongs to a log, not to a car
+FULL = 1.0  # prior charge of a log that does not state it
 TABLE = (*PARAMETERS, CHARGE)
-WIDTHS = {"body.yaw_inertia": 0.3}  # known beforehand: standard deviation of a logarithm
-ABSOLUTE = {  # the same, of a parameter that may as well be next to nothing, in its own unit
+WIDTHS = {"body.yaw_inertia": 0.3}  # prior standard deviations of logarithms
+ABSOLUTE = {  # prior standard deviations in SI units, of parameters that may be near zero
     CHARGE: 0.5,
     "body.front_roll_share": 0.25,
     "motor.conduction": 0.5,
@@ -116,19 +119,22 @@ ABSOLUTE = {  # the same, of a parameter that may as well be next to nothing, in
 
 
 class Stage(NamedTuple):
-    """A fit of some parameters to some windows."""
+    """The parameters of one fit, and the windows that it uses."""
 
     parameters: tuple[str, ...]
-    chooses: Callable[[Shots], np.ndarray]  # windows that tell of them
+    chooses: Callable[[Shots], np.ndarray]  # mask of the windows in which they show
 
 
 def straight(shots: Shots) -> np.ndarray:
-    """Windows in which nothing is steered."""
+    """True for windows whose steering stays below `STRAIGHT`: (windows,)."""
     return np.max(np.abs(shots.steering), axis=1) < STRAIGHT
 
 
 def slides(shots: Shots) -> np.ndarray:
-    """Windows in which the car slides past the limit, or spins its wheels."""
+    """True for windows with sideslip beyond `SLIDES` or wheelspin beyond `SPINS`: (windows,).
+
+    False for windows without motion capture.
+    """
     vx, vy = (np.nan_to_num(shots.measured[:, i]) for i in (0, 1))
     sideslip = np.arctan2(np.abs(vy), np.maximum(np.abs(vx), 0.3))
     wheels = np.nan_to_num(shots.measured[:, 3] - np.hypot(vx, vy))
@@ -137,12 +143,12 @@ def slides(shots: Shots) -> np.ndarray:
 
 
 def steered(shots: Shots) -> np.ndarray:
-    """Windows that are neither straight nor past the limit."""
+    """True for windows that are neither straight nor sliding: (windows,)."""
     return ~straight(shots) & ~slides(shots)
 
 
 def any_window(shots: Shots) -> np.ndarray:
-    """All of them."""
+    """True for every window: (windows,)."""
     return np.full(len(shots.surface), True)
 
 
@@ -157,7 +163,7 @@ ORDER = ("longitudinal", "steering", "handling", "drift", "all")
 
 
 class Parameter(NamedTuple):
-    """One number that is fitted: a path, for one surface or one log or (None) for all."""
+    """A fitted number: the path of a parameter, and its surface or log (None: all)."""
 
     path: str
     surface: int | None = None
@@ -165,22 +171,22 @@ class Parameter(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """What a fit makes of a parameter, in the units used inside."""
+    """The result for one parameter, in SI units and radians."""
 
     path: str
     surface: str | None
     run: int | None
-    before: float
+    before: float  # prior value
     value: float
-    deviation: float  # standard deviation: the larger of the two below
-    by_curvature: float
-    by_halves: float
-    determined: bool  # else it was left at what it was
-    at_bound: bool
+    deviation: float  # standard deviation: the larger of `by_curvature` and `by_halves`
+    by_curvature: float  # from the curvature of the cost (`deviations`)
+    by_halves: float  # from fits to two halves of the data
+    determined: bool  # False: reset to its prior value
+    at_bound: bool  # of its declared range
 
 
 class Result(NamedTuple):
-    """A fit and what it is worth."""
+    """The fitted cars, their parameters and the cost."""
 
     cars: dict[str, Car]  # by surface
     fitted: list[Fitted]
@@ -189,7 +195,7 @@ class Result(NamedTuple):
 
 
 def declaration(path: str) -> Declaration:
-    """The declaration of a car's parameter by its dotted path of names inside, or of `CHARGE`."""
+    """The declaration of a car's parameter, by its dotted path of fields, or of `CHARGE`."""
     if path == CHARGE:
         return Declaration("1", 0.0, 1.0, "of the battery at a log's windows", "fitted")
     *rooms, name = path.split(".")
@@ -198,7 +204,7 @@ def declaration(path: str) -> Declaration:
 
 
 def value_of(car: Car, path: str) -> float:
-    """A car's parameter by its dotted path."""
+    """The value of a car's parameter, by its dotted path of fields."""
     value: Any = car
     for name in path.split("."):
         value = getattr(value, name)
@@ -212,7 +218,12 @@ def take_shots(
     faults: Sequence[list[LogDefect]],
     every: float = 0.25,
 ) -> tuple[Shots, np.ndarray]:
-    """All windows of all runs without those that a fault touches, and when they start."""
+    """The windows of all runs without false data, and their start times (s): (windows,).
+
+    `surfaces` and `faults` are by run. `every` (s) is the time between two starts. A defect of all
+    columns removes the windows that it overlaps. A defect of one column makes its quantity
+    unknown (NaN) in them. Raises `InputError` if no window is left.
+    """
     names = list(cars)
     parts, starts = [], []
     for i, (run, surface) in enumerate(zip(runs, surfaces, strict=True)):
@@ -234,11 +245,12 @@ def take_shots(
     return shooting.joined(parts), np.concatenate(starts)
 
 
+# Index in `QUANTITIES` of the quantity that a column measures
 COLUMNS = {"gyro_radps": 2, "yaw_rate_radps": 2, "wheel_speed_mps": 3, "encoder_counts": 3}
 
 
 def without(shots: Shots, column: str, where: np.ndarray) -> Shots:
-    """The windows with one quantity unknown in some of them."""
+    """The windows, with the quantity of a column unknown (NaN) in those of the mask `where`."""
     index = COLUMNS.get(column)
     if index is None:
         return shots
@@ -248,11 +260,11 @@ def without(shots: Shots, column: str, where: np.ndarray) -> Shots:
 
 
 def blocks(time: np.ndarray, run: np.ndarray, fold: int = 2) -> np.ndarray:
-    """Of windows of logs, by their start: 1 for those to fit, 2 for those held out, else 0.
+    """Split windows by their start times: 1 is fitted, 2 is held out, 0 is neither.
 
-    Blocks of `HELD_OUT` seconds take turns, two to fit and one (`fold` of 0 to 2) to hold out; a
-    window that reaches from one kind into the other belongs to neither. Beside longer logs, one
-    that is `brief` is fitted whole: it is a manoeuvre, and its parts are unlike.
+    Time is cut into blocks of `HELD_OUT` seconds. Of every three blocks, the one of number `fold`
+    (0 to 2) is held out and two are fitted. A window that overlaps both kinds is neither. A `brief`
+    log is fitted whole if there are longer ones: it is one manoeuvre, and its parts differ.
     """
     held = [np.floor((time + lead) / HELD_OUT) % 3 == fold for lead in (0.0, HORIZON)]
     kind = np.where(held[0] & held[1], 2, np.where(held[0] | held[1], 0, 1))
@@ -261,27 +273,30 @@ def blocks(time: np.ndarray, run: np.ndarray, fold: int = 2) -> np.ndarray:
 
 
 def brief(time: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Whether a window is of a log whose windows lie within `BRIEF` seconds."""
+    """True for windows of logs whose windows all start within `BRIEF` seconds: (windows,)."""
     return np.array([np.ptp(time[run == k]) < BRIEF for k in run])
 
 
 class Solved(NamedTuple):
-    """Where a search ended."""
+    """The end of a search."""
 
-    x: np.ndarray
+    x: np.ndarray  # u of each free parameter
     cost: float
     fun: np.ndarray  # residuals
-    nfev: int
+    nfev: int  # evaluations of residuals or Jacobian
 
 
 def loss(residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Half the soft L1 loss of each residual; the factors of its gradient and of its curvature."""
+    """Half the soft L1 loss of each residual r, and the factors of its gradient and curvature.
+
+    With c = `OUTLYING` and q = sqrt(1 + (r/c)²), they are c² (q - 1), 1/q and 1/q³.
+    """
     root = np.sqrt(1 + (residuals / OUTLYING) ** 2)
     return OUTLYING**2 * (root - 1), 1 / root, 1 / root**3
 
 
 class Problem:
-    """Residuals and their derivatives for some free parameters over some windows."""
+    """Residuals of windows and their derivatives over the free parameters."""
 
     def __init__(
         self,
@@ -291,29 +306,30 @@ class Problem:
         prior: dict[str, Car] | None = None,
         charge: np.ndarray | None = None,
     ) -> None:
-        """`free` paths are fitted: those of the floor for each surface that has windows.
+        """`free` are the paths to fit. Those of `FLOOR` are fitted for each surface with windows.
 
-        `cars` say what the others are, and what is expected, unless `prior` says that; `charge`, by
-        log, how full the battery is where a log does not tell. `CHARGE` is free for those logs.
+        `cars` give all other values and the start of the search. They are the prior too, unless
+        `prior` is given. `charge` (logs,) gives the charge of logs that do not state it, by
+        default `FULL`. If `CHARGE` is in `free`, it is fitted for those logs.
         """
         self.cars = cars
         self.shots = shots
-        self.surface = np.zeros(int(shots.run.max()) + 1, int)  # by log
+        self.surface = np.zeros(int(shots.run.max()) + 1, int)  # surface of each log
         self.surface[shots.run] = shots.surface
         surfaces = [int(k) for k in np.unique(shots.surface)]
-        untold = [int(k) for k in np.unique(shots.run[np.isnan(shots.charge)])]
+        without_charge = [int(k) for k in np.unique(shots.run[np.isnan(shots.charge)])]
         self.parameters = []
         for path in free:
             if path == CHARGE:
-                self.parameters += [Parameter(path, run=k) for k in untold]
+                self.parameters += [Parameter(path, run=k) for k in without_charge]
             elif path in FLOOR:
                 self.parameters += [Parameter(path, surface=k) for k in surfaces]
             else:
                 self.parameters.append(Parameter(path))
         self.known = np.isfinite(shots.measured)
         count = np.bincount(shots.run)
-        usual = np.median(count[count > 0])
-        self.divisor = np.sqrt(count[shots.run] / usual * shots.measured.shape[-1])[:, None, None]
+        median = np.median(count[count > 0])
+        self.divisor = np.sqrt(count[shots.run] / median * shots.measured.shape[-1])[:, None, None]
         self.divisor = self.divisor * SCALES[:, None]
         self.table = self.tabled(cars, charge)
         self.index = np.array([TABLE.index(p.path) for p in self.parameters], int)
@@ -338,57 +354,63 @@ class Problem:
         self.prior = np.clip(self.prior, self.low + margin, self.high - margin)
 
     def tabled(self, cars: dict[str, Car], charge: np.ndarray | None = None) -> np.ndarray:
-        """The values of `TABLE` in each log: (logs, `TABLE`)."""
+        """The values of `TABLE` for each log, or `charge` if it states none: (logs, `TABLE`)."""
         logs = len(self.surface)
-        known = np.full(logs, FULL) if charge is None else charge[:logs].copy()
-        tells = np.isfinite(self.shots.charge)
-        known[self.shots.run[tells]] = self.shots.charge[tells]
+        charges = np.full(logs, FULL) if charge is None else charge[:logs].copy()
+        stated = np.isfinite(self.shots.charge)
+        charges[self.shots.run[stated]] = self.shots.charge[stated]
         of_car = np.array([[value_of(car, path) for path in PARAMETERS] for car in cars.values()])
-        return np.column_stack([of_car[self.surface], known])
+        return np.column_stack([of_car[self.surface], charges])
 
     def moves(self, parameter: Parameter) -> np.ndarray:
-        """The logs that a parameter is of."""
+        """True for the logs that a parameter affects: (logs,)."""
         if parameter.run is not None:
             return np.arange(len(self.surface)) == parameter.run
         return (self.surface == parameter.surface) | (parameter.surface is None)
 
     def inside(self, value: Array) -> Array:
-        """From a parameter's value to the fit's variable."""
+        """The search variables u: the logarithm of each free parameter, or its value."""
         return np.where(self.logarithmic, np.log(np.maximum(value, 1e-12)), value)
 
     def outside(self, u: Array) -> Array:
-        """The inverse of `inside`."""
+        """The values of the free parameters at u: the inverse of `inside`."""
         return np.where(self.logarithmic, np.exp(u), u)
 
     def filled(self, u: Array) -> np.ndarray:
-        """All values by log, as in `tabled`."""
+        """The values of `TABLE` for each log, with the free ones at u: (logs, `TABLE`)."""
         table = self.table.copy()
         for rows, index, value in zip(self.rows, self.index, self.outside(u), strict=True):
             table[rows, index] = value
         return table
 
     def predictions(self, u: Array = ()) -> np.ndarray:
-        """What is simulated: (windows, quantities, samples)."""
+        """The simulated quantities: (windows, quantities, samples)."""
         return in_lanes(predicted, self.base, self.filled(u)[self.shots.run], self.shots)
 
     def residuals(self, u: Array) -> np.ndarray:
-        """All residuals, those of the prior last."""
+        """The residuals of all samples, then those of the prior: (samples + parameters,).
+
+        A residual is 0 if the sample is unknown, and 100 if the prediction is NaN.
+        """
         found = self.predictions(u)
-        off = np.where(self.known, (found - self.shots.measured) / self.divisor, 0.0)
-        return np.concatenate([np.nan_to_num(off, nan=1e2).ravel(), (u - self.prior) / self.width])
+        data = np.where(self.known, (found - self.shots.measured) / self.divisor, 0.0)
+        return np.concatenate([np.nan_to_num(data, nan=1e2).ravel(), (u - self.prior) / self.width])
 
     def jacobian(self, u: Array) -> np.ndarray:
-        """The derivatives of `residuals`."""
+        """The derivatives of `residuals` over u: (residuals, parameters).
+
+        They are 0 for a window whose motion is chaotic.
+        """
         table, rates = self.filled(u), np.where(self.logarithmic, self.outside(u), 1.0)
-        # Each window with each group of the parameters that move it.
+        # A lane is a window with one group of the parameters that affect it.
         lanes, columns = [], []
         for run in np.unique(self.shots.run):
-            moves = [j for j, rows in enumerate(self.rows) if run in rows]
-            moves += moves[-1:] * (-len(moves) % GROUP)
+            affecting = [j for j, rows in enumerate(self.rows) if run in rows]
+            affecting += affecting[-1:] * (-len(affecting) % GROUP)  # repeated to full groups
             for window in np.flatnonzero(self.shots.run == run):
-                for first in range(0, len(moves), GROUP):
+                for first in range(0, len(affecting), GROUP):
                     lanes.append(window)
-                    columns.append(moves[first : first + GROUP])
+                    columns.append(affecting[first : first + GROUP])
         windows, group = np.array(lanes), np.array(columns)
         shots = jax.tree.map(lambda leaf: leaf[windows], self.shots)
         directions = np.zeros((*group.shape, len(TABLE)))
@@ -398,22 +420,22 @@ class Problem:
         whole = np.zeros((*self.shots.measured.shape, len(self.parameters)))
         whole[windows[:, None], :, :, group] = slopes
         whole = np.where(self.known[..., None], whole / self.divisor[..., None], 0.0)
-        # A motion that is chaos by the window's end has derivatives beyond all bounds: no guide.
-        wild = ~(np.abs(whole) * self.width < WILD)
-        whole[wild.any(axis=(1, 2, 3))] = 0.0
+        # A motion that turns chaotic within its window has unbounded derivatives. Drop them.
+        chaotic = ~(np.abs(whole) * self.width < WILD)
+        whole[chaotic.any(axis=(1, 2, 3))] = 0.0
         return np.concatenate([whole.reshape(-1, len(self.parameters)), np.diag(1 / self.width)])
 
     @property
     def base(self) -> Car:
-        """What is not fitted; surfaces differ in `PARAMETERS` alone."""
+        """A car with the values that are not fitted. Surfaces differ in `PARAMETERS` alone."""
         return next(iter(self.cars.values()))
 
     def solve(self, u: Array, passes: int) -> Solved:
-        """Levenberg and Marquardt's method from u, held in the ranges by projection.
+        """Minimise from u by the Levenberg-Marquardt method, projected onto the declared ranges.
 
-        A parameter at an end of its range that the gradient would push beyond takes no part in a
-        step. SciPy's `least_squares` knows the same loss and ranges, but both its methods stop
-        short here: where a parameter is next to an end, their trust region is next to nothing.
+        If descent would push a parameter beyond its bound, a step leaves that parameter out.
+        SciPy's `least_squares` has the same loss and bounds, but both of its methods stop early
+        here. Their trust region nearly vanishes when a parameter is close to a bound.
         """
         u = np.clip(u, self.low, self.high)
         fun, damping, evaluations = self.residuals(u), DAMPING, 1
@@ -430,20 +452,20 @@ class Problem:
                 step[free] = -np.linalg.solve(
                     block + damping * np.diag(np.diag(block)), gradient[free]
                 )
-                there = np.clip(u + step * self.width, self.low, self.high)
-                found, evaluations = self.residuals(there), evaluations + 1
-                if loss(found)[0].sum() < before:
+                candidate = np.clip(u + step * self.width, self.low, self.high)
+                candidate_fun, evaluations = self.residuals(candidate), evaluations + 1
+                if loss(candidate_fun)[0].sum() < before:
                     break
                 damping *= 4
             else:
                 break
-            u, fun, damping = there, found, max(damping / 3, EASY)
+            u, fun, damping = candidate, candidate_fun, max(damping / 3, EASY)
             if before - loss(fun)[0].sum() < TOLERANCE * before:
                 break
         return Solved(u, float(loss(fun)[0].sum()), fun, evaluations)
 
     def cars_at(self, u: Array) -> dict[str, Car]:
-        """The cars by surface; each keeps what is not fitted of its own."""
+        """The cars by surface with the fitted values at u. Each keeps its other values."""
         cars = dict(self.cars)
         for p, value in zip(self.parameters, self.outside(u), strict=True):
             for number, name in enumerate(cars):
@@ -452,31 +474,34 @@ class Problem:
         return cars
 
     def charge_at(self, u: Array) -> np.ndarray:
-        """How full the battery is, by log."""
+        """The battery charge of each log at u: (logs,)."""
         return self.filled(u)[:, -1]
 
 
 def with_values(car: Car, values: Array) -> Car:
-    """The car with all `PARAMETERS` replaced."""
+    """The car with all `PARAMETERS` replaced, in their order."""
     for path, value in zip(PARAMETERS, values, strict=True):
         car = changed(car, path, value)
     return car
 
 
 def shoot(car: Car, values: Array, shot: Shots) -> Array:
-    """`shooting.predict` for the values of `TABLE`."""
+    """`shooting.predict` with the values of `TABLE`: (quantities, samples)."""
     return shooting.predict(with_values(car, values[:-1]), shot._replace(charge=values[-1]), STEP)
 
 
 @jax.jit
 def predicted(car: Car, values: Array, shots: Shots) -> Array:
-    """`shoot` in lanes: values (lanes, `TABLE`)."""
+    """`shoot` for each lane of values (lanes, `TABLE`): (lanes, quantities, samples)."""
     return jax.vmap(lambda v, shot: shoot(car, v, shot))(values, shots)
 
 
 @jax.jit
 def differentiated(car: Car, values: Array, shots: Shots, directions: Array) -> Array:
-    """The derivatives of `predicted`, each lane along a group of directions of its own."""
+    """The derivatives of `predicted` along directions (lanes, group, `TABLE`).
+
+    Their shape is (lanes, group, quantities, samples).
+    """
 
     def slopes(v: Array, shot: Shots, along: Array) -> Array:
         return jax.vmap(lambda d: jax.jvp(lambda v: shoot(car, v, shot), (v,), (d,))[1])(along)
@@ -485,7 +510,7 @@ def differentiated(car: Car, values: Array, shots: Shots, directions: Array) -> 
 
 
 def in_lanes(program: Callable[..., Array], car: Car, *arguments: Any) -> np.ndarray:
-    """A program over any number of lanes, in blocks of `LANES` on all cores."""
+    """Call a compiled program for any number of lanes, in blocks of `LANES`, on all cores."""
     count = len(jax.tree.leaves(arguments)[0])
 
     def block(begin: int) -> np.ndarray:
@@ -497,7 +522,7 @@ def in_lanes(program: Callable[..., Array], car: Car, *arguments: Any) -> np.nda
     begins = range(0, count, LANES)
     if len(begins) == 1:
         return block(0)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled code runs beside Python
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled code runs in parallel
         return np.concatenate(list(pool.map(block, begins)))
 
 
@@ -507,19 +532,23 @@ def fit(
     what: str,
     report: Callable[[str], None] = lambda _: None,
 ) -> Result:
-    """Fit `what` of `STAGES`; `all` takes the stages in their order, and then everything at once.
+    """Fit the stage `what`. `all` fits the other stages in `ORDER`, then all parameters at once.
 
     `cars` are by surface, in the order of the shots' `surface`. Parameters that the logs do not
-    determine are named and put back. The charge of logs that do not tell it is fitted in each
-    stage; that of one log alone cannot be told from the motor.
+    determine are reported and reset to their prior.
+
+    Each stage also fits the charge of logs that do not state it. The exception is a single log in
+    a stage with parameters of `SPEEDS`: one log cannot separate charge and motor.
+
+    Raises `InputError` if no window suits the stage `what`.
     """
-    alone = len(np.unique(shots.run)) == 1
+    single_log = len(np.unique(shots.run)) == 1
     total = 0
     current, charge = cars, np.full(int(shots.run.max()) + 1, FULL)
     for name in ORDER if what == "all" else (what,):
         stage = STAGES[name]
         free = stage.parameters
-        if not (alone and set(free) & set(SPEEDS)):
+        if not (single_log and set(free) & set(SPEEDS)):
             free = (*free, CHARGE)
         chosen = stage.chooses(shots)
         if not chosen.any() and name == what:
@@ -542,7 +571,7 @@ def fit(
 
 
 def estimated_charge(cars: dict[str, Car], shots: Shots) -> np.ndarray:
-    """How full the battery was in each log: as it tells, or else as fits its windows best."""
+    """The battery charge of each log, as stated or else fitted to its windows: (logs,)."""
     problem = Problem(cars, shots, (CHARGE,))
     if not problem.parameters:
         return problem.table[:, -1]
@@ -550,14 +579,14 @@ def estimated_charge(cars: dict[str, Car], shots: Shots) -> np.ndarray:
 
 
 def with_charge(shots: Shots, charge: np.ndarray) -> Shots:
-    """The windows of logs of which it is known how full the battery was; others' was full."""
+    """The windows with `charge` (logs,) as that of their logs. Logs beyond it have `FULL`."""
     filled = np.full(max(len(charge), int(shots.run.max()) + 1), FULL)
     filled[: len(charge)] = charge
     return shots._replace(charge=filled[shots.run])
 
 
 def select(shots: Shots, chosen: np.ndarray) -> Shots:
-    """Some of the windows."""
+    """The windows that a mask or indices choose."""
     return jax.tree.map(lambda leaf: leaf[chosen], shots)
 
 
@@ -570,16 +599,19 @@ def believed(
     charge: np.ndarray | None = None,
     evaluations: int = 0,
 ) -> Result:
-    """The last fit and its deviations; what is not determined is put back, the rest refitted.
+    """The last fit, with deviations. Undetermined parameters are reset, the others refitted.
 
-    `cars` are what is expected; the solver starts at `current` and, by log, `charge`.
+    `cars` are the prior. The search starts at `current` and, for each log, at `charge`.
+    `evaluations` of earlier stages are added to its own.
     """
     problem = Problem(cars, shots, free)
     solved = problem.solve(Problem(current, shots, free, None, charge).start, PASSES)
     curvature, determined = deviations(problem, solved)
     if not determined.all():
-        loose = [p for p, known in zip(problem.parameters, determined, strict=True) if not known]
-        report("not determined: " + ", ".join(sorted({p.path for p in loose})))
+        undetermined = [
+            p for p, known in zip(problem.parameters, determined, strict=True) if not known
+        ]
+        report("not determined: " + ", ".join(sorted({p.path for p in undetermined})))
         held = Held(problem, determined)
         solved = held.solve(solved.x[determined], PASSES)
         whole = problem.prior.copy()
@@ -612,10 +644,10 @@ def believed(
 
 
 class Held(Problem):
-    """A problem with some of its parameters held at their prior."""
+    """A problem with some parameters fixed at their prior."""
 
     def __init__(self, whole: Problem, free: np.ndarray) -> None:
-        """`free` tells which stay."""
+        """`free` is True for the parameters that stay free: (parameters,)."""
         self.__dict__ |= vars(whole)
         for name in ("parameters", "rows"):
             kept = zip(getattr(whole, name), free, strict=True)
@@ -625,26 +657,30 @@ class Held(Problem):
 
 
 def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations by the curvature of the cost, and which parameters are determined.
+    """Standard deviations from the curvature of the cost, and the mask of determined parameters.
 
-    A window counts as one observation of each quantity (the residuals are divided so), and the
-    noise is taken from the windows' mean square residuals, never less than one. The parameter that
-    adds least to its prior is taken as known, and so on, until the data say something of each that
-    is left: of two that only their sum is known of, one is determined given the other.
+    deviation = sqrt(diag(inverse(D'D / noise + P'P))), where D and P are the Jacobian's rows of
+    data and prior. They are weighted by the curvature of the loss. A window counts as one
+    observation of each quantity, since w divides by the root of its samples. noise is the sum of
+    the squared residuals, each at most `GROSS`, over the observations. It is at least 1.
+
+    The parameter with the largest ratio of deviation to prior width is fixed. This repeats until
+    all remaining ratios are below `KNOWN`. If the data give only the sum of two parameters, one
+    of them is fixed and the other is determined.
     """
     count = len(problem.parameters)
     observations = max(1, int(problem.known[:, :, -1].sum()))
-    curved = np.sqrt(loss(solved.fun)[2])[:, None] * problem.jacobian(solved.x)
-    data, expected = curved[:-count], curved[-count:]
+    weighted = np.sqrt(loss(solved.fun)[2])[:, None] * problem.jacobian(solved.x)
+    data, prior = weighted[:-count], weighted[-count:]
     noise = max(1.0, float(np.sum(np.minimum(solved.fun[:-count] ** 2, GROSS)) / observations))
-    information = data.T @ data / noise + expected.T @ expected
+    information = data.T @ data / noise + prior.T @ prior
     left = list(range(count))
     deviation = problem.width.copy()
     while left:
-        some = np.sqrt(np.diag(np.linalg.pinv(information[np.ix_(left, left)])))
-        deviation[left] = some
-        worst = int(np.argmax(some / problem.width[left]))
-        if some[worst] < KNOWN * problem.width[left[worst]]:
+        posterior = np.sqrt(np.diag(np.linalg.pinv(information[np.ix_(left, left)])))
+        deviation[left] = posterior
+        worst = int(np.argmax(posterior / problem.width[left]))
+        if posterior[worst] < KNOWN * problem.width[left[worst]]:
             break
         del left[worst]
     determined = np.isin(np.arange(count), left)
@@ -652,13 +688,14 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
 
 
 def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Half the difference between fits to two halves of the data: its eighths, by turns.
+    """Half the difference between fits to two halves of the data: (parameters,).
 
-    0 for what only one half tells of.
+    Windows in the order of their logs are cut into eighths. The even eighths are one half, the odd
+    ones the other. The result is 0 for a parameter whose surface or log is in one half only.
     """
     rank = np.argsort(np.argsort(whole.shots.run, kind="stable"))
     eighth = rank * 8 // len(rank)
-    ends, known = np.tile(u, (2, 1)), np.full(len(u), True)
+    ends, in_both = np.tile(u, (2, 1)), np.full(len(u), True)
     for half, end in enumerate(ends):
         problem = Problem(
             whole.cars,
@@ -666,26 +703,29 @@ def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarr
             list(dict.fromkeys(p.path for p in whole.parameters)),
             charge=whole.charge_at(u),
         )
-        place = np.array([whole.parameters.index(p) for p in problem.parameters], int)
-        free = determined[place]
-        end[place[free]] = Held(problem, free).solve(u[place[free]], 12).x
-        known &= np.isin(np.arange(len(u)), place)
-    return np.where(known, np.abs(ends[1] - ends[0]) / 2, 0.0)
+        columns = np.array([whole.parameters.index(p) for p in problem.parameters], int)
+        free = determined[columns]
+        end[columns[free]] = Held(problem, free).solve(u[columns[free]], 12).x
+        in_both &= np.isin(np.arange(len(u)), columns)
+    return np.where(in_both, np.abs(ends[1] - ends[0]) / 2, 0.0)
 
 
 def errors(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
-    """Median absolute errors at the windows' ends and RMS over them, beside persistence."""
+    """Errors of each measured quantity: simulated, and by persistence (no change after the start).
+
+    An error is the median magnitude at the ends of windows, and the RMS over all their samples.
+    """
     found = Problem(cars, shots, ()).predictions()
     start = np.stack(
         [shots.velocity.x, shots.velocity.y, shots.velocity.yaw, shots.wheel_speed], axis=1
     )[:, :, None]
     result: dict[str, Any] = {"windows": len(shots.surface)}
     for name, prediction in (("simulated", found), ("persistence", start)):
-        off = prediction - shots.measured
+        error = prediction - shots.measured
         result[name] = {
             quantity: {
-                "median_abs_error": float(np.nanmedian(np.abs(off[:, i, -1]))),
-                "rmse": float(np.sqrt(np.nanmean(off[:, i] ** 2))),
+                "median_abs_error": float(np.nanmedian(np.abs(error[:, i, -1]))),
+                "rmse": float(np.sqrt(np.nanmean(error[:, i] ** 2))),
             }
             for i, quantity in enumerate(QUANTITIES)
             if np.isfinite(shots.measured[:, i, -1]).any()
