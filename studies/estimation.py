@@ -23,16 +23,16 @@ from countersteer.batch.population import Drawn, draw, load_population
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
-from countersteer.course.along import legs_of
 from countersteer.course.course import Course
 from countersteer.course.files import load_course
+from countersteer.course.position import legs_of
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.straighten import straighten
 from countersteer.estimation.pose import PoseFilter
 from countersteer.link.link import ONBOARD
 from countersteer.sensing.faults import KINDS, SensorFault
-from countersteer.task.task import PERIOD, Outcome, Score
+from countersteer.task.judge import PERIOD, Outcome, Score
 from countersteer.world import battery
 from countersteer.world.walls import padded
 from studies.watches import FIT, PARTICLES, SAMPLE, Errors, Places, anywhere

@@ -23,7 +23,7 @@ from countersteer.car.parameter import changed
 from countersteer.compiling import configure_jax
 from countersteer.drivers.replay import Replay
 from countersteer.pilot import Pilot
-from countersteer.recording import Drive, about_run, drive
+from countersteer.recorded_drive import Drive, about_run, drive
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run, read_run
 from countersteer.simulator import Simulator

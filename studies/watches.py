@@ -11,19 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer import streams
+from countersteer import random_streams
 from countersteer.batch.trials import Instant
 from countersteer.car.car import Sonar
 from countersteer.car.parameter import pytree
-from countersteer.course.along import Legs
 from countersteer.course.course import Course
+from countersteer.course.position import Legs
 from countersteer.drivers.drift_turn import STRAIGHT
 from countersteer.estimation import dead_reckoning, pose, spikes
 from countersteer.estimation.estimate import Estimate
+from countersteer.random_streams import Stream
 from countersteer.signals import Array, Scalar
 from countersteer.simulator import heard
-from countersteer.streams import Stream
-from countersteer.task.task import PERIOD
+from countersteer.task.judge import PERIOD
 from countersteer.world.chassis import Vector, dot, solve
 
 SLIPS = math.radians(10)  # sideslip from which on the car drifts
@@ -197,7 +197,7 @@ class Places:
         motion = now.simulator.world.motion(now.loop.state)
         zero = jnp.zeros_like(motion.x)
         still = Estimate(zero, zero, motion.heading, zero, zero, zero)
-        key, own = jax.random.split(streams.key(now.simulator.root, Stream.WATCH))
+        key, own = jax.random.split(random_streams.key(now.simulator.root, Stream.WATCH))
         none = jnp.full_like(self.turns, jnp.inf)
         still = still._replace(heading=now.pilot.estimator.estimate(now.memory.estimate).heading)
         picked = jax.random.randint(own, (self.particles,), 0, len(self.uniform[0]))

@@ -17,14 +17,14 @@ from countersteer.course.course import Course
 from countersteer.drivers.replay import Replay
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
-from countersteer.recording import Drive as Recorded
-from countersteer.recording import about_run
-from countersteer.recording import drive as write_drive
+from countersteer.recorded_drive import Drive as Recorded
+from countersteer.recorded_drive import about_run
+from countersteer.recorded_drive import drive as write_drive
 from countersteer.runs.run import Run, read_run
 from countersteer.signals import Motion
 from countersteer.simulator import Record, Simulator
 from countersteer.task import turns
-from countersteer.task.task import PERIOD, Sample, Score, Task
+from countersteer.task.judge import PERIOD, Sample, Score, Task
 from countersteer.world import planar
 from countersteer.world.floor import Floor
 from countersteer.world.state import State

@@ -11,16 +11,16 @@ from scipy.stats import chi2
 from countersteer.batch.population import draw, load_population
 from countersteer.batch.trials import run_trials
 from countersteer.car.files import load_car
-from countersteer.course.along import legs_of
 from countersteer.course.course import from_segments
 from countersteer.course.files import load_course
+from countersteer.course.position import legs_of
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.estimation import lidar_walls
 from countersteer.estimation.kalman import diagonal
 from countersteer.pilot import Pilot
 from countersteer.sensing import lidar
 from countersteer.simulator import Simulator, scan
-from countersteer.task.task import Outcome
+from countersteer.task.judge import Outcome
 from countersteer.world.walls import padded
 from studies.watches import Errors
 

@@ -14,8 +14,8 @@ from countersteer.batch.evaluate import interval
 from countersteer.batch.population import draw, load_population
 from countersteer.car.files import load_car
 from countersteer.cli import main
-from countersteer.course.along import line_of
 from countersteer.course.files import load_course
+from countersteer.course.position import line_of
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.errors import InputError
 from countersteer.pilot import Pilot

@@ -22,8 +22,8 @@ from countersteer.experiments import (
     stop_time,
     turn_rate,
 )
-from countersteer.experiments.found import write
 from countersteer.experiments.open_turns import Series
+from countersteer.experiments.result import write
 from countersteer.runs.run import read_run
 from countersteer.signals import Command
 from test_open_turns import LANES, TIME, slowing, write_run

@@ -34,11 +34,11 @@ from countersteer.drivers.policy import load_policy, save_policy
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
-from countersteer.recording import frames
+from countersteer.recorded_drive import frames
 from countersteer.runs.files import column_rows, command_rows, read_commands, read_table
 from countersteer.runs.recorder import Pace, Recorder, new_folder
 from countersteer.runs.run import read_run
-from countersteer.sensing.suite import channels
+from countersteer.sensing.all_sensors import channels
 from countersteer.text import read_text, tables_of
 from countersteer.viewing.picture import draw_picture
 from countersteer.viewing.report import report_html

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "countersteer"
 
-EVERYONE = {"errors", "text", "progress", "signals", "streams", "compiling"}
+EVERYONE = {"errors", "text", "progress", "signals", "random_streams", "compiling"}
 MAY_IMPORT = {
     "car": set(),
     "course": {"car"},
@@ -24,11 +24,11 @@ MAY_IMPORT = {
     "task": {"car", "course"},
     "runs": {"car", "course"},
     "tuning": {"car", "world", "sensing", "runs"},
-    "recording": {  # a drive into a run's folder
+    "recorded_drive": {  # a drive into a run's folder
         "car", "course", "world", "sensing", "link", "drivers", "pilot", "simulator", "task",
         "runs",
     },
-    "verdict": {"course", "task", "runs", "tuning"},  # the judge of a folder
+    "judge_run": {"course", "task", "runs", "tuning"},  # the judge of a folder
     "batch": {
         "car", "course", "world", "sensing", "link", "pilot", "simulator", "task",
         "estimation", "drivers",  # what open drives are told of the truth
@@ -51,7 +51,7 @@ MAY_IMPORT = {
         "batch", "tuning",  # what came of trials and of fits
     },
     "cli": None,
-    "face": None,  # what `import countersteer` gives
+    "api": None,  # what `import countersteer` gives
     "__init__": None,
     "__main__": {"cli"},
 }  # fmt: skip

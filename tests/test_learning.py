@@ -10,7 +10,7 @@ from countersteer.course.files import load_course
 from countersteer.drivers import policy
 from countersteer.drivers.policy import load_policy
 from countersteer.learning import turning
-from countersteer.task.task import Outcome, Score
+from countersteer.task.judge import Outcome, Score
 from countersteer.task.turns import Turns
 
 

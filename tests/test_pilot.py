@@ -15,12 +15,12 @@ from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.errors import InputError
-from countersteer.estimation.library import ESTIMATORS
+from countersteer.estimation.registry import ESTIMATORS
 from countersteer.pilot import Pilot, pilot_of_run
 from countersteer.runs.files import read_commands
 from countersteer.runs.run import read_run
 from countersteer.runs.telemetry import readings_at
-from countersteer.sensing.suite import channels
+from countersteer.sensing.all_sensors import channels
 from countersteer.signals import Command, Motion
 from countersteer.simulator import Simulator, scan
 from countersteer.world.state import State

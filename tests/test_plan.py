@@ -13,13 +13,13 @@ import conftest
 from conftest import judged
 from countersteer import cli
 from countersteer.car.files import load_car
-from countersteer.course.along import legs_of, line_of
 from countersteer.course.course import place, progress
 from countersteer.course.files import load_course
+from countersteer.course.position import legs_of, line_of
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Heard, Observation
-from countersteer.drivers.library import make_driver
 from countersteer.drivers.plan import library, plan
+from countersteer.drivers.registry import make_driver
 from countersteer.errors import InputError
 from countersteer.estimation.estimate import Estimate
 from countersteer.runs.files import read_commands

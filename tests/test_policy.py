@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from countersteer.drivers.library import make_driver
 from countersteer.drivers.policy import TABLES, load_policy, policy_tables, save_policy
+from countersteer.drivers.registry import make_driver
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.errors import InputError
 from countersteer.runs.files import read_commands

@@ -19,7 +19,7 @@ from countersteer.course.course import place
 from countersteer.course.files import load_course
 from countersteer.drivers.replay import Replay
 from countersteer.errors import InputError
-from countersteer.sensing import lidar, parts, sonar, suite
+from countersteer.sensing import all_sensors, error_models, lidar, sonar
 from countersteer.signals import Motion
 
 RX7 = load_car("rx7")
@@ -231,18 +231,22 @@ TICKS, DT = 1500, 1e-3
 
 
 @pytest.fixture(scope="module")
-def listen() -> Callable[..., suite.Readings]:
+def listen() -> Callable[..., all_sensors.Readings]:
     """All readings after each of 1500 ticks of 1 ms, for a motion given by tick."""
     walls = np.full((8, 4), np.nan)
     walls[0] = [2.0, -5, 2.0, 5]
     corners = np.asarray(sonar.edges(walls))
 
     def run(
-        car: Car, motion: Motion, memory: suite.SensorMemory, key: jax.Array, every: suite.Periods
-    ) -> suite.Readings:
-        def tick(memory: suite.SensorMemory, now: tuple) -> tuple:
+        car: Car,
+        motion: Motion,
+        memory: all_sensors.SensorMemory,
+        key: jax.Array,
+        every: all_sensors.Periods,
+    ) -> all_sensors.Readings:
+        def tick(memory: all_sensors.SensorMemory, now: tuple) -> tuple:
             count, motion = now
-            memory = suite.sense(car, walls, corners, memory, motion, key, count, every, DT)
+            memory = all_sensors.sense(car, walls, corners, memory, motion, key, count, every, DT)
             return memory, memory.readings
 
         counts = jnp.arange(1, TICKS + 1, dtype=jnp.int32)
@@ -250,7 +254,7 @@ def listen() -> Callable[..., suite.Readings]:
 
     program = jax.jit(run, static_argnums=4)
 
-    def told(car: Car, seed: int = 0, **changes: Any) -> suite.Readings:
+    def told(car: Car, seed: int = 0, **changes: Any) -> all_sensors.Readings:
         motion = jax.tree.map(
             lambda leaf: np.broadcast_to(np.float64(leaf), TICKS), start(car, 4).motion
         )
@@ -259,14 +263,14 @@ def listen() -> Callable[..., suite.Readings]:
         )
         key = jax.random.key(seed)
         first = jax.tree.map(lambda leaf: leaf[0], motion)
-        memory = jax.tree.map(jnp.asarray, suite.initial_memory(car, first, DT))
-        readings = program(car, motion, memory, key, suite.periods(car, DT))
+        memory = jax.tree.map(jnp.asarray, all_sensors.initial_memory(car, first, DT))
+        readings = program(car, motion, memory, key, all_sensors.periods(car, DT))
         return jax.tree.map(np.asarray, readings)
 
     return told
 
 
-def fresh(reading: suite.Reading) -> np.ndarray:
+def fresh(reading: all_sensors.Reading) -> np.ndarray:
     """Ticks at which a sensor reported, each once."""
     ticks = np.arange(1, TICKS + 1)
     return ticks[reading.tick == ticks]
@@ -300,7 +304,10 @@ def test_rates_hold_at_every_step_that_is_short_enough(dt: float) -> None:
         1 / sensors.voltmeter.rate,
     )
     for name, period, ticks in zip(
-        suite.Periods._fields, (*wanted, None, None), suite.periods(RX7, dt), strict=True
+        all_sensors.Periods._fields,
+        (*wanted, None, None),
+        all_sensors.periods(RX7, dt),
+        strict=True,
     ):
         if period is None:
             assert ticks is None, f"the rx7 has no {name}"
@@ -327,7 +334,7 @@ def test_the_encoder_steps_by_033_mps_and_does_not_tell_direction(listen: Callab
     wheels = start(RX7, 4).motion.wheels
     speed = 2.0 / radius
 
-    def told(spin: object) -> suite.Readings:
+    def told(spin: object) -> all_sensors.Readings:
         return listen(RX7, wheels=wheels._replace(rear_left=spin))
 
     forward, backward = told(speed), told(-speed)
@@ -423,8 +430,8 @@ def test_the_noise_of_different_sensors_is_independent(listen: Callable) -> None
 
 
 def test_quantising_by_nothing_changes_nothing() -> None:
-    assert float(parts.quantised(0.123456789, 0.0)) == 0.123456789
-    assert float(parts.quantised(0.26, 0.5)) == 0.5
+    assert float(error_models.quantised(0.123456789, 0.0)) == 0.123456789
+    assert float(error_models.quantised(0.26, 0.5)) == 0.5
 
 
 # The line detector
@@ -474,7 +481,7 @@ def test_the_eye_turns_with_the_car(listen: Callable) -> None:
 def test_without_lines_the_detector_is_not_there(listen: Callable) -> None:
     told = listen(RX7)
     assert told.line_crossings is told.line_speed is None
-    assert suite.initial_memory(RX7, start(RX7, 4).motion, DT).eye is None
+    assert all_sensors.initial_memory(RX7, start(RX7, 4).motion, DT).eye is None
 
 
 @pytest.mark.parametrize("name", ["box", "ess"])
@@ -604,15 +611,17 @@ def test_a_position_without_heading_and_parts_that_are_off_are_not_there(listen:
     assert told.position_y is not None
     none = listen(RX7)
     assert none.lidar is none.position_x is none.position_y is none.position_heading is None
-    assert suite.initial_memory(RX7, start(RX7, 4).motion, DT).poses is None
+    assert all_sensors.initial_memory(RX7, start(RX7, 4).motion, DT).poses is None
 
 
 def test_sensors_begin_for_cars_of_a_batch_too() -> None:
     """Where a car's numbers are traced, how many poses are kept comes from outside."""
     car = with_part(position=Position(reports="pose"))
-    slots = suite.position_slots(car, DT)
+    slots = all_sensors.position_slots(car, DT)
     begun = jax.eval_shape(
-        lambda car, motion: suite.initial_memory(car, motion, DT, slots), car, start(car, 4).motion
+        lambda car, motion: all_sensors.initial_memory(car, motion, DT, slots),
+        car,
+        start(car, 4).motion,
     )
     assert begun.poses.shape == (slots, 3)
 

@@ -17,7 +17,7 @@ from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.link.link import RADIO
 from countersteer.pilot import Pilot
-from countersteer.sensing import faults, suite
+from countersteer.sensing import all_sensors, faults
 from countersteer.sensing.faults import KINDS, SensorFault
 from countersteer.signals import Reading, Readings, flat, pairs
 from countersteer.simulator import Record, Simulator, scan
@@ -31,7 +31,7 @@ CAR = load_car(
         "sensors.line_detector.lines=across-x",
     ),
 )
-CHANNELS = suite.channels(CAR)
+CHANNELS = all_sensors.channels(CAR)
 PARTS = tuple(dict.fromkeys(c.sensor for c in flat(CHANNELS) if "sonar" not in c.sensor))
 SENSORS = ("sonar", "sonar_left", *PARTS)
 EVERY = tuple(itertools.product(SENSORS, KINDS))

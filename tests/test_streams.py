@@ -6,22 +6,22 @@ import jax
 import numpy as np
 
 from conftest import driven
-from countersteer import streams
+from countersteer import random_streams
 from countersteer.batch.population import draw, load_population
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
-from countersteer.streams import Stream
+from countersteer.random_streams import Stream
 
 
 def test_no_two_streams_nor_ticks_nor_seeds_share_a_key():
     """Keys that are drawn from, and those that a draw may split them into."""
 
     def keys(seed):
-        root = streams.root(seed)
-        once = [streams.key(root, stream) for stream in Stream]
+        root = random_streams.root(seed)
+        once = [random_streams.key(root, stream) for stream in Stream]
         often = [
-            jax.vmap(lambda tick, s=stream: streams.key(root, s, tick))(np.arange(500))
+            jax.vmap(lambda tick, s=stream: random_streams.key(root, s, tick))(np.arange(500))
             for stream in Stream
         ]
         drawn = np.concatenate([jax.random.key_data(k).reshape(-1, 2) for k in (*once, *often)])

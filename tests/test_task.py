@@ -15,13 +15,13 @@ from countersteer.course.course import Course, Turn, from_segments
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.replay import Replay
+from countersteer.judge_run import judge_run, samples_of
 from countersteer.runs.files import Table
 from countersteer.runs.importers.dart import import_dart
 from countersteer.runs.run import read_run
 from countersteer.signals import Motion, Wheels
 from countersteer.task import turns
-from countersteer.task.task import Outcome, Sample, Task, summary
-from countersteer.verdict import judge_run, samples_of
+from countersteer.task.judge import Outcome, Sample, Task, summary
 
 CAR = load_car("rx7")
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dart"

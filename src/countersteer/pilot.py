@@ -15,22 +15,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer import streams
+from countersteer import random_streams
 from countersteer.car.car import Car
 from countersteer.car.files import car_from_tables
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.course.files import course_of_run
 from countersteer.drivers.driver import Driver, Heard, Observation, Status, status_of
-from countersteer.drivers.library import driver_of_tables
 from countersteer.drivers.plan import Read
+from countersteer.drivers.registry import driver_of_tables
 from countersteer.errors import InputError
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.estimator import Estimator
-from countersteer.estimation.library import ESTIMATORS
+from countersteer.estimation.registry import ESTIMATORS
 from countersteer.link.link import LINKS, ONBOARD, Link
+from countersteer.random_streams import Stream
 from countersteer.signals import Array, Command, Reading, Readings, Scalar
-from countersteer.streams import Stream
 
 PYTHON_PERIOD = 0.005  # s between two decisions of a driver in plain Python, unless it has its own
 
@@ -72,7 +72,7 @@ class Pilot:
     ) -> "Pilot":
         """For a course and the nominal car, which is all that the pilot knows of the real one.
 
-        `estimate` names one of `estimation.library.ESTIMATORS`.
+        `estimate` names one of `estimation.registry.ESTIMATORS`.
         """
         return cls.with_estimator(driver, ESTIMATORS[estimate](course, nominal, dt), link, dt)
 
@@ -123,10 +123,10 @@ class Pilot:
             told = jax.tree.map(
                 lambda leaf: leaf if leaf.dtype.kind == "i" else leaf.astype(dtype), readings
             )
-            return jax.tree.map(np.asarray, _rerun(self, streams.root(seed), told, ticks))
+            return jax.tree.map(np.asarray, _rerun(self, random_streams.root(seed), told, ticks))
 
     def init(self, root: jax.Array) -> PilotMemory:
-        """Before the first decision; `root` is the drive's key (`streams.root`)."""
+        """Before the first decision; `root` is the drive's key (`random_streams.root`)."""
         if isinstance(root, jax.core.Tracer):
             return _init(self, root)
         with jax.enable_x64(self.dtype == np.float64):
@@ -193,8 +193,8 @@ class Pilot:
 
 
 def _init(pilot: Pilot, root: jax.Array) -> PilotMemory:
-    estimate = pilot.estimator.init(streams.key(root, Stream.ESTIMATOR))
-    memory = pilot.driver.reset(streams.key(root, Stream.DRIVER))
+    estimate = pilot.estimator.init(random_streams.key(root, Stream.ESTIMATOR))
+    memory = pilot.driver.reset(random_streams.key(root, Stream.DRIVER))
     dtype = jnp.result_type(pilot.estimator.estimate(estimate).x)
     if pilot.traced:
         memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)

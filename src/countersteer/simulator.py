@@ -19,18 +19,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer import streams
+from countersteer import random_streams
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Status
 from countersteer.link.link import ONBOARD, Link, Packets, exchange, initial_packets
 from countersteer.pilot import Pilot, PilotMemory
+from countersteer.random_streams import Stream
+from countersteer.sensing import all_sensors, sonar
 from countersteer.sensing import faults as failing
-from countersteer.sensing import sonar, suite
 from countersteer.sensing.faults import SensorFault
 from countersteer.signals import Array, Command, Motion, Readings, Scalar
-from countersteer.streams import Stream
 from countersteer.world import drivetrain, motor
 from countersteer.world.floor import Floor
 from countersteer.world.planar import planar
@@ -47,7 +47,7 @@ class Loop(NamedTuple):
 
     tick: Scalar
     state: Any  # the world's
-    sensors: suite.SensorMemory
+    sensors: all_sensors.SensorMemory
     up: Packets | None  # None: the pilot is on board
     down: Packets | None
     faulty: Readings | None = None  # what failing sensors have reported; None: none ever fails
@@ -88,7 +88,7 @@ class Simulator:
     seed: Scalar
     faults: tuple[SensorFault, ...]
     link: Link = dataclasses.field(metadata={"static": True})
-    every: suite.Periods = dataclasses.field(metadata={"static": True})
+    every: all_sensors.Periods = dataclasses.field(metadata={"static": True})
     slots: int = dataclasses.field(metadata={"static": True})  # poses kept for a late sensor
 
     @classmethod
@@ -126,8 +126,8 @@ class Simulator:
             seed=np.int32(seed),
             faults=cast(faults),
             link=link,
-            every=suite.periods(car, dt),
-            slots=suite.position_slots(car, dt),
+            every=all_sensors.periods(car, dt),
+            slots=all_sensors.position_slots(car, dt),
         )
 
     @property
@@ -149,7 +149,7 @@ class Simulator:
     @property
     def root(self) -> jax.Array:
         """The key that all of a drive's draws derive from."""
-        return streams.root(self.seed)
+        return random_streams.root(self.seed)
 
     def init(self) -> Loop:
         """Before the first tick."""
@@ -209,7 +209,7 @@ def begin(simulator: Simulator) -> Loop:
     world, link = simulator.world, simulator.link.in_ticks(simulator.dt)
     state = world.init(simulator.pose, simulator.velocity, simulator.charge)
     motion = world.motion(state)
-    sensors = suite.initial_memory(world.car, motion, world.dt, simulator.slots)
+    sensors = all_sensors.initial_memory(world.car, motion, world.dt, simulator.slots)
     up = down = None
     if not link.onboard:
         zero = simulator.dtype.type(0)
@@ -233,7 +233,7 @@ def advance(
     car, tick, after = world.car, loop.tick, loop.tick + 1
     up, down = loop.up, loop.down
     if up is not None:
-        key = streams.key(root, Stream.LINK, tick)
+        key = random_streams.key(root, Stream.LINK, tick)
         lost = jax.random.uniform(key, (2,)) < simulator.link.loss
         up = exchange(up, command, lost[0], tick, link.control, link.delay)
         fresh = up.arrived == tick
@@ -243,7 +243,7 @@ def advance(
         fresh = fresh | (stops & (tick - up.arrived == link.timeout + 1))
     before, events = world.motion(loop.state), world.events(loop.state)
     state = world.step(loop.state, command, tick)
-    sensors = suite.sense(
+    sensors = all_sensors.sense(
         car,
         simulator.walls,
         simulator.corners,

@@ -18,7 +18,7 @@ from countersteer.errors import InputError
 from countersteer.link.link import Link
 from countersteer.pilot import Pilot
 from countersteer.sensing.faults import SensorFault
-from countersteer.task.task import Outcome, Score
+from countersteer.task.judge import Outcome, Score
 
 DRIFT = math.radians(25)  # sideslip that makes a turn a drift
 CONFIDENCE = 0.95

@@ -22,7 +22,7 @@ from countersteer.drivers.driver import Driver, Heard, Observation
 from countersteer.drivers.replay import Replay
 from countersteer.estimation.estimate import Estimate
 from countersteer.signals import Array, Command, Motion
-from countersteer.task.task import PERIOD
+from countersteer.task.judge import PERIOD
 from countersteer.world import planar
 from countersteer.world.floor import Floor
 from countersteer.world.state import State

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from countersteer import streams
+from countersteer import random_streams
 from countersteer.car.car import Car
 from countersteer.car.parameter import Declaration, changed, declarations, unknown_key
 from countersteer.course.course import Course
 from countersteer.errors import InputError
+from countersteer.random_streams import Stream
 from countersteer.signals import Array, Scalar
-from countersteer.streams import Stream
 from countersteer.text import read_toml
 from countersteer.world import floor
 from countersteer.world.floor import LARGEST, Floor
@@ -184,7 +184,7 @@ def _floors(population: Population, seeds: Sequence[int], dtype: Any) -> Floor |
         @jax.jit
         @jax.vmap
         def laid(seed: Scalar) -> Floor:
-            key = streams.key(streams.root(seed), Stream.FLOOR)
+            key = random_streams.key(random_streams.root(seed), Stream.FLOOR)
             return floor.draw(key, deviation, length)
 
         drawn = laid(np.asarray(seeds, np.int32))

@@ -23,11 +23,11 @@ from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot, PilotMemory
-from countersteer.sensing import suite
+from countersteer.sensing import all_sensors
 from countersteer.sensing.faults import SensorFault
 from countersteer.signals import Array, Scalar
 from countersteer.simulator import Loop, Simulator, begin, tick
-from countersteer.task.task import PERIOD, Outcome, Sample, Score, Task
+from countersteer.task.judge import PERIOD, Outcome, Sample, Score, Task
 from countersteer.world import planar
 from countersteer.world.floor import Floor
 
@@ -181,7 +181,7 @@ def run_trials(
     simulator = dataclasses.replace(
         _without(simulator, "pose", "velocity", "charge", "seed"),
         world=_without(world, "car", "floor"),
-        slots=suite.position_slots(drawn.cars, pilot.dt),
+        slots=all_sensors.position_slots(drawn.cars, pilot.dt),
     )
     common, own = _common(drivers, dtype)
     shared = Shared(

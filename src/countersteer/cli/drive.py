@@ -10,7 +10,7 @@ from countersteer.cli.options import (
     number,
     physics,
 )
-from countersteer.cli.record import record
+from countersteer.cli.recorded import record
 from countersteer.drivers import DRIVERS
 from countersteer.errors import InputError
 
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.link.link import LINKS
-    from countersteer.recording import prepare
+    from countersteer.recorded_drive import prepare
     from countersteer.sensing.faults import read_fault
 
     course, car = load_course(options.course), load_car(options.car, options.set)

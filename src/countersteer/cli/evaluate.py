@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
-    from countersteer.drivers.library import make_driver
+    from countersteer.drivers.registry import make_driver
     from countersteer.link.link import LINKS
     from countersteer.runs.files import read_commands
     from countersteer.runs.recorder import new_folder

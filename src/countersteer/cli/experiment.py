@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> int:
     """`experiment`."""
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
-    from countersteer.experiments.found import write
+    from countersteer.experiments.result import write
     from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from countersteer.cli.options import DONE, Verbs, number, physics
-from countersteer.cli.record import record
+from countersteer.cli.recorded import record
 from countersteer.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,10 +43,10 @@ def run(options: argparse.Namespace) -> int:
     """`replay`."""
     from countersteer.car.files import load_car
     from countersteer.course.files import course_of_run
-    from countersteer.drivers.library import replay
+    from countersteer.drivers.registry import replay
     from countersteer.estimation.dead_reckoning import DeadReckoning
     from countersteer.pilot import Pilot
-    from countersteer.recording import Drive, about_run
+    from countersteer.recorded_drive import Drive, about_run
     from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator

@@ -17,8 +17,8 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree, unknown_key
-from countersteer.course.along import Line, Place, line_of
 from countersteer.course.course import Course
+from countersteer.course.position import Line, Place, line_of
 from countersteer.drivers import drift_turn
 from countersteer.drivers.drift_turn import DriftTurn
 from countersteer.drivers.driver import Observation, Status, paced

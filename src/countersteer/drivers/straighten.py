@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
-from countersteer.course.along import Legs, legs_of
 from countersteer.course.course import Course
+from countersteer.course.position import Legs, legs_of
 from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.errors import InputError
 from countersteer.estimation.wall_angle import WallAngle, wall_angle

@@ -14,7 +14,7 @@ from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
 from countersteer.drivers.replay import Replay
-from countersteer.experiments.found import Found, Report, silent
+from countersteer.experiments.result import Report, Result, silent
 from countersteer.runs.run import Run, drawn_car
 from countersteer.task.turns import sideslip
 
@@ -25,14 +25,14 @@ DRIVE = 2.2  # s
 LONGEST = 10.0  # s of a run's commands
 
 
-def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Found:
+def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Result:
     """From rest, on open floor."""
     lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
     driver = commands(*((t, u, lock * part) for t, u, part in STEPS))
     return _found(car, name, driver, DRIVE, STEPS[1][0], report, lanes)
 
 
-def measure(runs: Sequence[Run]) -> Found:
+def measure(runs: Sequence[Run]) -> Result:
     """The commands of a run, with its car."""
     told, car = runs[0].commands, drawn_car(runs[0].about)
     driver = Replay(times=told["time_s"], throttle=told["throttle"], steering=told["steering"])
@@ -42,7 +42,7 @@ def measure(runs: Sequence[Run]) -> Found:
 
 def _found(
     car: Car, name: str, driver: Replay, longest: float, mark: float, report: Report, lanes: int
-) -> Found:
+) -> Result:
     charge, wear = (grid.ravel() for grid in np.meshgrid(CHARGES, WEARS, indexing="ij"))
     count = len(charge)
     cars = changed(repeated(car, count), "battery.wear", wear.astype(np.float32))
@@ -110,4 +110,4 @@ def _found(
         )
         figure.suptitle(f"battery: {name}")
 
-    return Found(table, figures, text, paint)
+    return Result(table, figures, text, paint)

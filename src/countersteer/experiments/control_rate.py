@@ -25,11 +25,11 @@ from countersteer.car.parameter import changed
 from countersteer.course.course import Course, from_segments
 from countersteer.drivers.drift_turn import DriftTurn, drift_turn
 from countersteer.drivers.played_turn import STEP, PlayedTurn
-from countersteer.experiments.found import Found, Report, silent
+from countersteer.experiments.result import Report, Result, silent
 from countersteer.link.link import LINKS
 from countersteer.pilot import Pilot
 from countersteer.simulator import Simulator
-from countersteer.task.task import Outcome, Score
+from countersteer.task.judge import Outcome, Score
 
 TRIALS = 256
 SPEED = 2.0  # m/s
@@ -62,7 +62,7 @@ def record(course: Course, car: Car, driver: DriftTurn) -> tuple[np.ndarray, np.
 
 def simulate(
     car: Car, name: str, report: Report = silent, trials: int = TRIALS, lanes: int = LANES
-) -> Found:
+) -> Result:
     """Eight cells of trials: rate, loop, battery."""
     course = corner()
     closed = drift_turn(course, car, SPEED)
@@ -87,7 +87,7 @@ def simulate(
         "cells": [dict(zip(rows, cell, strict=True)) for cell in zip(*rows.values(), strict=True)],
     }
     text = _text(name, trials, rows, cells)
-    return Found(rows, figures, text, partial(_paint, name, trials, rows, errors), (11.0, 4.6))
+    return Result(rows, figures, text, partial(_paint, name, trials, rows, errors), (11.0, 4.6))
 
 
 class Cell(NamedTuple):

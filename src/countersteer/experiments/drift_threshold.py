@@ -16,8 +16,8 @@ from countersteer.batch.evaluate import DRIFT
 from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.errors import InputError
-from countersteer.experiments.found import Found, Report, silent
 from countersteer.experiments.open_turns import OFF, series_of
+from countersteer.experiments.result import Report, Result, silent
 from countersteer.runs.run import Run, drawn_car
 from countersteer.task.turns import sideslip
 
@@ -27,7 +27,7 @@ DRIVE = 2.0  # s
 OVER = math.radians(5)
 
 
-def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Found:
+def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Result:
     """Four locks at 37 speeds, to the left."""
     full = float(car.servo.limit_left)
     lock, speed = (grid.ravel() for grid in np.meshgrid(LOCKS, SPEEDS, indexing="ij"))
@@ -45,7 +45,7 @@ def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -
     return _found(car, f"{name}, simulated", full * lock, entry, peak)
 
 
-def measure(runs: Sequence[Run]) -> Found:
+def measure(runs: Sequence[Run]) -> Result:
     """Moments of logs; needs motion capture, as nothing else tells sideslip."""
     rows = []
     for run in runs:
@@ -67,7 +67,7 @@ def measure(runs: Sequence[Run]) -> Found:
     return _found(drawn_car(runs[0].about), f"{len(runs)} runs", lock, entry, peak)
 
 
-def _found(car: Car, name: str, lock: np.ndarray, speed: np.ndarray, peak: np.ndarray) -> Found:
+def _found(car: Car, name: str, lock: np.ndarray, speed: np.ndarray, peak: np.ndarray) -> Result:
     energy = float(car.body.mass) * speed**2 / 2
     drifts = peak > DRIFT
     thresholds: list[dict[str, Any]] = []
@@ -120,7 +120,7 @@ def _found(car: Car, name: str, lock: np.ndarray, speed: np.ndarray, peak: np.nd
         figure.colorbar(dots, ax=ax, label="wheel angle, °")
         figure.suptitle(f"drift-threshold: {name}")
 
-    return Found(table, figures, text, paint, (7.0, 4.0))
+    return Result(table, figures, text, paint, (7.0, 4.0))
 
 
 def _threshold(of: dict[str, Any]) -> str:

@@ -15,8 +15,8 @@ from countersteer.car.car import Car
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.errors import InputError
 from countersteer.experiments.control_rate import LONGEST, SPEED, corner
-from countersteer.experiments.found import Found, Report, silent
 from countersteer.experiments.open_turns import Series, series_of, stops
+from countersteer.experiments.result import Report, Result, silent
 from countersteer.pilot import Pilot
 from countersteer.runs.run import Run
 from countersteer.simulator import Simulator
@@ -25,7 +25,7 @@ from countersteer.task.turns import sideslip
 BEFORE, BEHIND = 1.0, 0.8  # s about the kill that are shown
 
 
-def simulate(car: Car, name: str, report: Report = silent) -> Found:
+def simulate(car: Car, name: str, report: Report = silent) -> Result:
     """The nominal car with a full battery, at 2 m/s."""
     course = corner()
     simulator = Simulator.of(course, jax.tree.map(np.float32, car))
@@ -53,7 +53,7 @@ def simulate(car: Car, name: str, report: Report = silent) -> Found:
     return _found(f"{name}, simulated", series, more)
 
 
-def measure(runs: Sequence[Run]) -> Found:
+def measure(runs: Sequence[Run]) -> Result:
     """The first turn that was stopped in these runs."""
     for run in runs:
         series = series_of(run)
@@ -62,7 +62,7 @@ def measure(runs: Sequence[Run]) -> Found:
     raise InputError("--from: no turn was stopped in these runs")
 
 
-def _found(name: str, series: Series, more: dict[str, np.ndarray]) -> Found:
+def _found(name: str, series: Series, more: dict[str, np.ndarray]) -> Result:
     turns = stops(series, undisturbed=False)
     if not turns:
         raise InputError(f"drift-turn: {name} holds no turn that was stopped")
@@ -131,4 +131,4 @@ def _found(name: str, series: Series, more: dict[str, np.ndarray]) -> Found:
         rows[-1].set_xlabel("time from the kill, s (dotted: stopped)")
         figure.suptitle(f"drift-turn: {name}")
 
-    return Found(table, figures, text, paint, (9.0, 8.0))
+    return Result(table, figures, text, paint, (9.0, 8.0))

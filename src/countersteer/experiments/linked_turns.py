@@ -19,7 +19,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course, Turn
 from countersteer.drivers.drift_turn import drift_turn
-from countersteer.experiments.found import Found, Report, silent
+from countersteer.experiments.result import Report, Result, silent
 from countersteer.pilot import Pilot
 from countersteer.signals import Scalar
 from countersteer.task.turns import ROUNDING, STRAIGHT_FOR, goes_straight
@@ -72,7 +72,7 @@ def open_floor(angle: float = ANGLE) -> Course:
     return Course("open floor", 1.4, False, line, none, turns, (0.0, 0.0, 0.0), 0.0, FAR)
 
 
-def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS) -> Found:
+def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS) -> Result:
     """Over random cars; the heading's error is that at the end of the last turn."""
     course, seeds = open_floor(), range(trials)
     drawn = draw(load_population("around"), car, course, seeds, np.float32)
@@ -115,7 +115,7 @@ def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS)
     table: dict[str, Any] = {"seed": list(seeds)}
     for label, values in errors.items():
         table[f"heading_error_{label.replace(' ', '_')}_deg"] = values
-    return Found(table, figures, text, paint, (7.0, 4.0))
+    return Result(table, figures, text, paint, (7.0, 4.0))
 
 
 def _figures(errors: np.ndarray) -> dict[str, float]:

@@ -27,7 +27,7 @@ from countersteer.drivers.corner import Corner
 from countersteer.drivers.policy import library
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.drivers.turning import Turning
-from countersteer.experiments.found import Found, Report, silent
+from countersteer.experiments.result import Report, Result, silent
 
 DRAWS = 512
 GATE = 1.2  # m before and behind the corner
@@ -125,7 +125,7 @@ def _scaled(turning: Turning, factor: float) -> Turning:
 
 def simulate(
     car: Car, name: str, report: Report = silent, draws: int = DRAWS, lanes: int = LANES
-) -> Found:
+) -> Result:
     """Bisection for the narrowest width of either law, and times over a range of widths."""
     tried, narrowest = search(car, report, draws, lanes)
     order = sorted(tried)
@@ -166,7 +166,7 @@ def simulate(
         slides: np.zeros((3, 0)) if math.isnan(width) else tried[slides, width].track
         for slides, width in narrowest.items()
     }
-    return Found(
+    return Result(
         table,
         figures_of_all,
         _text(name, draws, found, fastest),

@@ -8,8 +8,8 @@ from countersteer.batch.engine import LANES
 from countersteer.car.car import Car
 from countersteer.drivers.policy import library
 from countersteer.experiments import stop_regression
-from countersteer.experiments.found import Found, Report, silent
 from countersteer.experiments.open_turns import as_table, of_run, trial
+from countersteer.experiments.result import Report, Result, silent
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
 
@@ -18,7 +18,7 @@ TRIALS, SPEEDS, CHARGE = 1000, (1.0, 3.0), (0.3, 1.0)
 
 def simulate(
     car: Car, name: str, report: Report = silent, trials: int = TRIALS, lanes: int = LANES
-) -> Found:
+) -> Result:
     """Turns in the open with the laws of the library's policy, as `trials turns` drives them."""
     rows = trial(
         car, library().turning, None, range(trials), SPEEDS, CHARGE, report=report, lanes=lanes
@@ -26,13 +26,13 @@ def simulate(
     return _found(as_table(rows), f"{name}, simulated")
 
 
-def measure(runs: Sequence[Run]) -> Found:
+def measure(runs: Sequence[Run]) -> Result:
     """The turns of logs that were stopped."""
     rows = [row for run in runs for row in of_run(run.path)]
     return _found(as_table(rows), f"{len(runs)} runs")
 
 
-def _found(table: Table, name: str) -> Found:
+def _found(table: Table, name: str) -> Result:
     found = stop_regression.regress_stops(table)
     told = stop_regression.about(found)
     times = "; ".join(map(_region, told["regions"]))
@@ -54,7 +54,7 @@ def _found(table: Table, name: str) -> Found:
         stop_regression.paint(found, figure)
         figure.suptitle(f"stop-time: {name}")
 
-    return Found(columns, {"car": name, **told}, text, paint)
+    return Result(columns, {"car": name, **told}, text, paint)
 
 
 def _region(told: dict[str, Any]) -> str:

@@ -19,8 +19,8 @@ from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.errors import InputError
-from countersteer.experiments.found import Found, Report, silent
 from countersteer.experiments.open_turns import series_of
+from countersteer.experiments.result import Report, Result, silent
 from countersteer.runs.run import Run, drawn_car
 
 SPEEDS = (0.5, 0.8, 1.1)  # m/s
@@ -32,7 +32,7 @@ EVEN = 0.15  # rad/s: deviation of a standing yaw rate
 GENTLE = 1.5  # m/s² across, where nothing tells of slip
 
 
-def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Found:
+def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Result:
     """Every second degree of lock at three speeds."""
     left, right = float(car.servo.limit_left), float(car.servo.limit_right)
     angles = STEP * np.arange(-math.floor(right / STEP + 1e-6), math.floor(left / STEP + 1e-6) + 1)
@@ -53,7 +53,7 @@ def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -
     return _found(car, f"{name}, simulated", asked, vx, vy, rate)
 
 
-def measure(runs: Sequence[Run]) -> Found:
+def measure(runs: Sequence[Run]) -> Result:
     """Stretches of logs."""
     rows: list[tuple[float, ...]] = []
     for run in runs:
@@ -75,7 +75,7 @@ def measure(runs: Sequence[Run]) -> Found:
 
 def _found(
     car: Car, name: str, asked: np.ndarray, vx: np.ndarray, vy: np.ndarray, rate: np.ndarray
-) -> Found:
+) -> Result:
     rear = float(car.body.wheelbase - car.body.front_axle)
     slip = np.arctan2(vy - rear * rate, np.maximum(vx, 1e-3))
     grips = np.where(np.isfinite(slip), np.abs(slip) < GRIPS, np.abs(vx * rate) < GENTLE)
@@ -135,4 +135,4 @@ def _found(
         flat.legend(frameon=False)
         figure.suptitle(f"turn-rate: {name}")
 
-    return Found(table, figures, text, paint)
+    return Result(table, figures, text, paint)

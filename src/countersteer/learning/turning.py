@@ -21,7 +21,7 @@ from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.policy import TABLES, Policy
 from countersteer.pilot import Pilot
-from countersteer.task.task import Outcome, Score
+from countersteer.task.judge import Outcome, Score
 
 SPEEDS = (1.5, 2.0, 2.5, 3.0)  # m/s asked for, by turns
 SLOWEST = 1.1  # m/s: a trial that takes longer is lost

@@ -7,13 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from countersteer import streams
+from countersteer import random_streams
 from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.errors import InputError
-from countersteer.sensing.suite import channels
+from countersteer.random_streams import Stream
+from countersteer.sensing.all_sensors import channels
 from countersteer.signals import Array, Channel, Reading, Readings, Scalar, flat, pairs, unflat
-from countersteer.streams import Stream
 
 KINDS = ("dead", "stuck", "spike")
 ASTRAY = 10.0  # m by which a place may seem to be off
@@ -57,7 +57,7 @@ def report(
 
     Only readings taken in this tick change anything. Spikes are drawn from the drive's key `root`.
     """
-    key = streams.key(root, Stream.FAULTS, tick)
+    key = random_streams.key(root, Stream.FAULTS, tick)
     time, told = tick * dt, []
     for i, ((channel, old), new) in enumerate(
         zip(pairs(channels(car), last), flat(now), strict=True)

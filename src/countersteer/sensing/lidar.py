@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from countersteer.car.car import Lidar
-from countersteer.sensing.parts import quantised
+from countersteer.sensing.error_models import quantised
 from countersteer.signals import Array, Scalar
 
 SEAM = 1e-5  # m by which a wall is taken to be longer, so that no beam slips between two

@@ -44,7 +44,7 @@ from countersteer.errors import InputError
 from countersteer.runs import defects
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
-from countersteer.sensing import parts
+from countersteer.sensing import error_models
 from countersteer.signals import Array, Command, Scalar, Wheels
 from countersteer.tuning.speed import TO_DEVIATION, read_speed
 from countersteer.tuning.windows import asked
@@ -420,7 +420,7 @@ def _rim(car: Car, wheels: Wheels) -> Scalar:
     """Speed that the encoder reports (m/s)."""
     encoder = car.sensors.encoder
     radius = car.tires.rear.radius if "rear" in encoder.on else car.tires.front.radius
-    return radius * parts.disc_speed(encoder, wheels, drivetrain.driven_speed(car, wheels))
+    return radius * error_models.disc_speed(encoder, wheels, drivetrain.driven_speed(car, wheels))
 
 
 # -------------------------------------------------------------------------------------------------

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.parameter import pytree
-from countersteer.course.along import Line, line_of
 from countersteer.course.course import Course
+from countersteer.course.position import Line, line_of
 from countersteer.signals import Array, Motion, Scalar
 from countersteer.task import turns as turning
 from countersteer.task.turns import (

@@ -10,7 +10,7 @@ from countersteer.errors import InputError
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run, drawn_car
 from countersteer.signals import Motion, Wheels
-from countersteer.task.task import PERIOD, Outcome, Sample, Score, Task, summary
+from countersteer.task.judge import PERIOD, Outcome, Sample, Score, Task, summary
 from countersteer.tuning.windows import read_measured
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from countersteer.cli.options import DONE, FAILED, INTERRUPTED, Progress
 
 if TYPE_CHECKING:
-    from countersteer.recording import Drive
+    from countersteer.recorded_drive import Drive
 
 
 TRACED = 0.9  # s by when the loop has been traced, which needs Python, and is being compiled
@@ -19,7 +19,7 @@ TRACED = 0.9  # s by when the loop has been traced, which needs Python, and is b
 def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
     from countersteer.compiling import configure_jax
-    from countersteer.recording import drive
+    from countersteer.recorded_drive import drive
     from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
     from countersteer.viewing.picture import Painter
@@ -49,7 +49,7 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
 
 def prepare_the_rest(what: "Drive") -> None:
     """Compiles what judge and page need, on another core than the one that compiles the loop."""
-    from countersteer.recording import warm_up
+    from countersteer.recorded_drive import warm_up
     from countersteer.viewing import view
 
     warm_up(what)

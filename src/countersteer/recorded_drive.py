@@ -16,16 +16,16 @@ from countersteer.car.car import Car
 from countersteer.car.files import car_tables, load_car
 from countersteer.course.course import Course
 from countersteer.course.files import course_tables
-from countersteer.drivers.library import make_driver
+from countersteer.drivers.registry import make_driver
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
 from countersteer.runs.files import read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
+from countersteer.sensing.all_sensors import channels
 from countersteer.sensing.faults import SensorFault, fault_tables
-from countersteer.sensing.suite import channels
 from countersteer.signals import Motion, Wheels, truth_columns
 from countersteer.simulator import PIECE, Record, Simulator
-from countersteer.task.task import PERIOD, Outcome, Sample, Task, summary
+from countersteer.task.judge import PERIOD, Outcome, Sample, Task, summary
 from countersteer.world.floor import Floor, floor_tables
 
 VELOCITY = ("vx_mps", "vy_mps", "yaw_rate_radps")

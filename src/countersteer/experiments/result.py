@@ -15,7 +15,7 @@ def silent(done: int, of: int) -> None:
     """Reports to nobody."""
 
 
-class Found(NamedTuple):
+class Result(NamedTuple):
     """A table (columns by name, with units), figures for JSON, a paragraph, a picture."""
 
     table: Mapping[str, Sequence[Any] | np.ndarray]
@@ -25,7 +25,7 @@ class Found(NamedTuple):
     size: tuple[float, float] = (10.0, 4.0)  # inches
 
 
-def write(found: Found, folder: Path, name: str) -> dict[str, Any]:
+def write(found: Result, folder: Path, name: str) -> dict[str, Any]:
     """Write NAME.csv, NAME.png and summary.json; returns what the last holds."""
     import matplotlib
 

@@ -14,13 +14,13 @@ from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
 from countersteer.drivers.driver import Driver
-from countersteer.drivers.library import make_driver
+from countersteer.drivers.registry import make_driver
 from countersteer.errors import InputError
-from countersteer.estimation.library import ESTIMATORS
+from countersteer.estimation.registry import ESTIMATORS
 from countersteer.link.link import LINKS
 from countersteer.progress import Progress
-from countersteer.recording import drive as record
-from countersteer.recording import prepare
+from countersteer.recorded_drive import drive as record
+from countersteer.recorded_drive import prepare
 from countersteer.runs.files import read_commands
 from countersteer.runs.recorder import new_folder
 from countersteer.runs.run import Run as RunFolder

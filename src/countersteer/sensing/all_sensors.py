@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer import streams
+from countersteer import random_streams
 from countersteer.car.car import Car
-from countersteer.sensing import lidar, parts, sonar
+from countersteer.random_streams import Stream
+from countersteer.sensing import error_models, lidar, sonar
 from countersteer.signals import Array, Channel, Motion, Reading, Readings, Scalar
-from countersteer.streams import Stream
 from countersteer.world import drivetrain, motor
 from countersteer.world.chassis import Vector
 
@@ -131,7 +131,7 @@ def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None
     eye, poses, part = None, None, sensors.line_detector
     if part.lines != "none":
         readings = readings._replace(line_crossings=none, line_speed=none)
-        eye = parts.eye(part, motion.x, motion.heading)
+        eye = error_models.eye(part, motion.x, motion.heading)
     if sensors.lidar.beams:
         no_echoes = np.full(sensors.lidar.beams, np.inf, dtype)
         readings = readings._replace(lidar=none._replace(value=no_echoes))
@@ -161,7 +161,7 @@ class Now(NamedTuple):
 
     def noise(self, stream: Stream, shape: tuple[int, ...] = ()) -> jax.Array:
         """Standard normal noise of a sensor at this tick."""
-        key = streams.key(self.root, stream, tick=self.tick)
+        key = random_streams.key(self.root, stream, tick=self.tick)
         return jax.random.normal(key, shape, jnp.result_type(self.motion.x))
 
     @property
@@ -188,8 +188,8 @@ def sense(
     """The sensors after a tick. Noise is drawn once a reading, from the drive's key `root`."""
     sensors = car.sensors
     shaft = drivetrain.driven_speed(car, motion.wheels)
-    speed = parts.disc_speed(sensors.encoder, motion.wheels, shaft)
-    turned = memory.disc + dt * parts.regions_per_second(sensors.encoder, speed)
+    speed = error_models.disc_speed(sensors.encoder, motion.wheels, shaft)
+    turned = memory.disc + dt * error_models.regions_per_second(sensors.encoder, speed)
     passed = jnp.floor(turned)
     memory = memory._replace(disc=turned - passed, counts=memory.counts + jnp.abs(passed))
     slots = 0 if memory.poses is None else len(memory.poses)
@@ -216,7 +216,7 @@ def sense(
     for is_due, report in reports:
         readings = jax.lax.cond(is_due, partial(report, now), lambda same: same, readings)
     if memory.eye is not None:
-        eye = parts.eye(sensors.line_detector, motion.x, motion.heading)
+        eye = error_models.eye(sensors.line_detector, motion.x, motion.heading)
         readings = cross(car, readings, memory.eye, eye, tick, dt)
         memory = memory._replace(eye=eye)
     moves = Vector(motion.vx, motion.vy, motion.yaw_rate)
@@ -233,7 +233,7 @@ def report_sonar(turn: Scalar, now: Now, readings: Readings) -> Readings:
     fires: tuple[jax.Array, ...] = (jnp.asarray(1.0),) * len(part.mounts)
     if part.firing == "in-turn":
         fires = tuple(jnp.where(turn == i, 1.0, 0.0) for i in range(len(part.mounts)))
-    key = streams.key(now.root, Stream.SONAR, tick=now.tick)
+    key = random_streams.key(now.root, Stream.SONAR, tick=now.tick)
     found = sonar.distances(part, now.walls, now.corners, now.pose, fires, key)
     return readings._replace(
         sonar=tuple(
@@ -248,7 +248,7 @@ def report_sonar(turn: Scalar, now: Now, readings: Readings) -> Readings:
 def report_gyroscope(now: Now, readings: Readings) -> Readings:
     """The yaw rate."""
     part, noise = now.car.sensors.gyroscope, now.noise(Stream.GYROSCOPE)
-    rate = parts.gyroscope(part, now.motion.yaw_rate, noise)
+    rate = error_models.gyroscope(part, now.motion.yaw_rate, noise)
     return readings._replace(gyroscope=Reading(rate, now.tick))
 
 
@@ -261,7 +261,7 @@ def report_accelerometer(now: Now, readings: Readings) -> Readings:
     ax = (motion.vx - before.x) / time - (before.yaw * before.y + motion.yaw_rate * motion.vy) / 2
     ay = (motion.vy - before.y) / time + (before.yaw * before.x + motion.yaw_rate * motion.vx) / 2
     noise = now.noise(Stream.ACCELEROMETER, (2,))
-    x, y = parts.accelerometer(now.car.sensors.accelerometer, ax, ay, noise)
+    x, y = error_models.accelerometer(now.car.sensors.accelerometer, ax, ay, noise)
     return readings._replace(accel_x=Reading(x, now.tick), accel_y=Reading(y, now.tick))
 
 
@@ -270,7 +270,7 @@ def report_encoder(now: Now, readings: Readings) -> Readings:
     part, tires, memory = now.car.sensors.encoder, now.car.tires, now.memory
     radius = tires.rear.radius if "rear" in part.on else tires.front.radius
     time = now.since(readings.wheel_speed)
-    speed = parts.wheel_speed(part, radius, memory.counts - memory.counts_before, time)
+    speed = error_models.wheel_speed(part, radius, memory.counts - memory.counts_before, time)
     return readings._replace(
         counts=Reading(memory.counts, now.tick), wheel_speed=Reading(speed, now.tick)
     )
@@ -283,7 +283,7 @@ def report_voltmeter(now: Now, readings: Readings) -> Readings:
     voltage = motor.drive(
         car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, now.shaft
     ).battery_voltage
-    volts = parts.voltmeter(car.sensors.voltmeter, voltage, noise)
+    volts = error_models.voltmeter(car.sensors.voltmeter, voltage, noise)
     return readings._replace(battery=Reading(volts, now.tick))
 
 
@@ -301,7 +301,9 @@ def report_position(now: Now, readings: Readings) -> Readings:
     poses = now.memory.poses
     assert poses is not None
     noise = now.noise(Stream.POSITION, (3,))
-    then = parts.position(now.car.sensors.position, poses[(now.tick + 1) % len(poses)], noise)
+    then = error_models.position(
+        now.car.sensors.position, poses[(now.tick + 1) % len(poses)], noise
+    )
     new: dict[str, Any] = {
         name: Reading(value, now.tick)
         for name, value in zip(POSITION, then, strict=True)
@@ -320,7 +322,7 @@ def cross(
     part, last, speed = car.sensors.line_detector, readings.line_crossings, readings.line_speed
     assert last is not None
     assert speed is not None
-    entered = parts.lines_entered(part, before, eye)
+    entered = error_models.lines_entered(part, before, eye)
     again = (entered > 0) & (last.tick >= 0)
     between = jnp.maximum(tick - last.tick, 1) * dt
     return readings._replace(
