@@ -1,4 +1,4 @@
-"""The one error that a person caused and can mend."""
+"""The one error that the user causes and can fix."""
 
 
 class InputError(Exception):

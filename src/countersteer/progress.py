@@ -5,10 +5,10 @@ from typing import Any
 
 
 class Progress:
-    """A progress bar where someone looks: on a terminal or in a notebook."""
+    """A progress bar, on a terminal or in a notebook only."""
 
     def __init__(self, quiet: bool = False) -> None:
-        """Quiet shows nothing anywhere."""
+        """If `quiet`, nothing is shown."""
         self._quiet = quiet or not (sys.stderr.isatty() or "ipykernel" in sys.modules)
         self._bar: Any = None
 
@@ -20,7 +20,7 @@ class Progress:
             self._bar.close()
 
     def show(self, done: float, of: float) -> None:
-        """Moves the bar."""
+        """Move the bar to `done` of `of`."""
         if self._quiet:
             return
         if self._bar is None:

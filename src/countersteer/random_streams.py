@@ -1,4 +1,4 @@
-"""Random streams by name: each draw of a drive has a key that no other draw has.
+"""Random streams by name: each draw of a drive has its own key.
 
 root(seed) ─► key(root, stream) ─► key(root, stream, tick) ─► one draw, or a split for several
 """
@@ -11,7 +11,7 @@ from countersteer.signals import Scalar
 
 
 class Stream(IntEnum):
-    """Who draws. A number stays what it is: records repeat by it."""
+    """The parts that draw. Never change a number: a record repeats only with the same numbers."""
 
     GYROSCOPE = 1
     ACCELEROMETER = 2

@@ -1,20 +1,20 @@
-"""The signals of the seam between what drives and what is driven: readings in, command out.
+"""The signals between driver and car: readings to the driver, a command to the car.
 
 A `Channel` declares a quantity once: its name at every edge, its unit, its range and its shape.
-Headers of tables, messages of MCAP files, ranges of failing sensors and help derive from it.
+Headers of tables, messages of MCAP files, ranges of sensor faults and help derive from it.
 """
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
-# A number: Python's, NumPy's or one that JAX traces; with axes in front, a batch. These have
-# no type in common that arithmetic keeps, so the checker is told nothing.
+# A number of Python, NumPy or JAX (traced). With leading axes it is a batch. These have no
+# common type that arithmetic keeps, so the type is `Any`.
 Scalar: TypeAlias = Any
 Array: TypeAlias = Any  # the same with one axis or more
 
 
 class Wheels(NamedTuple):
-    """One value for each wheel, in the order that the whole project uses."""
+    """One value for each wheel, in the project's fixed order."""
 
     front_left: Scalar
     front_right: Scalar
@@ -23,14 +23,14 @@ class Wheels(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What a driver asks for."""
+    """The command of a driver."""
 
     throttle: Scalar  # -1 to 1; negative is reverse or brake
     steering: Scalar  # angle of the front wheels, rad, positive to the left
 
 
 class Motion(NamedTuple):
-    """All of a car that changes smoothly. SI units, radians, ISO 8855 axes."""
+    """The continuous state of a car. SI units, radians, ISO 8855 axes."""
 
     x: Scalar  # centre of mass, m
     y: Scalar
@@ -39,15 +39,15 @@ class Motion(NamedTuple):
     vy: Scalar
     yaw_rate: Scalar
     wheels: Wheels  # spin of each wheel, rad/s, positive forward
-    steering: Scalar  # angle that a wheel between the front wheels would have
-    duty: Scalar  # of the speed controller, -1 to 1, behind the throttle
-    load_ax: Scalar  # accelerations that the wheel loads have followed so far, m/s²
+    steering: Scalar  # angle of an imaginary wheel midway between the front wheels
+    duty: Scalar  # of the speed controller, -1 to 1; it lags the throttle
+    load_ax: Scalar  # lagged accelerations that set the wheel loads, m/s²
     load_ay: Scalar
     charge: Scalar  # of the battery, 0 to 1
 
 
 class Reading(NamedTuple):
-    """A sensor's last report; `tick` is -1 until there was one."""
+    """A sensor's last report. `tick` is -1 before the first one."""
 
     value: Scalar
     tick: Scalar
@@ -64,29 +64,29 @@ class Readings(NamedTuple):
     accel_y: Reading
     battery: Reading  # V
     line_crossings: Reading | None = None  # lines entered since the start; None: no line detector
-    line_speed: Reading | None = None  # m/s, their spacing over the time since the last one
+    line_speed: Reading | None = None  # m/s, line spacing over the time since the last line
     lidar: Reading | None = None  # (beams,), m, from right to left; inf: no echo; None: no lidar
     position_x: Reading | None = None  # m; None: no such sensor
     position_y: Reading | None = None
-    position_heading: Reading | None = None  # rad; None: the sensor tells no heading
-    truth: Motion | None = None  # ground truth, which no car has: for the estimator `truth` alone
+    position_heading: Reading | None = None  # rad; None: no heading
+    truth: Motion | None = None  # ground truth, for the estimator `truth` only
 
 
 class Channel(NamedTuple):
-    """A quantity that a sensor reports, a state holds or a command asks for."""
+    """A quantity of a sensor, a state or a command."""
 
     name: str  # at every edge, with its unit
-    unit: str  # inside
-    low: Scalar  # the range of its values, in that unit; infinite where nothing bounds it
+    unit: str  # internal
+    low: Scalar  # range of its values in that unit; infinite if unbounded
     high: Scalar
     meaning: str
-    sensor: str = ""  # the part that reports it; empty: none does
+    sensor: str = ""  # the sensor that reports it; empty: none
     shape: tuple[int, ...] = ()
-    whole: bool = False  # whether it counts something
+    whole: bool = False  # whether it is a count
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of its numbers: one of a scalar, else numbered before the unit."""
+        """Names of its columns: one for a scalar, else one per number, numbered before the unit."""
         if not self.shape:
             return (self.name,)
         stem, _, unit = self.name.rpartition("_")
@@ -131,6 +131,6 @@ def unflat(like: Readings, parts: Sequence[Any]) -> Readings:
 
 
 def flat(readings: Readings) -> Sequence[Any]:
-    """What there is of a car's sensors, in the order of the tables; without the ground truth."""
+    """The parts for the car's sensors, in the order of the tables, without the ground truth."""
     others = (part for part in readings[1:-1] if part is not None)
     return (*readings.sonar, *others)

@@ -4,9 +4,9 @@
         ▲                                                   │
         └──────────────── link ◄──── command ◄──────────────┘
 
-`Simulator` is the half that is driven: `init`, then `readings` and `apply` in turn. `Pilot` is the
-half that drives. `run` takes both round the loop. Time is an integer tick: in each one the command
-goes over the link, the world takes a step, and the sensors look at where it led.
+`Simulator` holds the car, world, sensors and link: call `init`, then `readings` and `apply` in
+turn. `Pilot` gives the commands. `run` closes the loop. Time is an integer tick. In each tick, the
+command passes the link, the world takes a step, and the sensors measure the result.
 """
 
 import dataclasses
@@ -37,20 +37,20 @@ from countersteer.world.planar import planar
 from countersteer.world.walls import padded
 from countersteer.world.world import World
 
-PIECE = 0.5  # s of car time that are scanned at once; records are flushed between pieces
+PIECE = 0.5  # s of simulated time in one piece; records are flushed between pieces
 
 MakeWorld = Callable[[Car, Array, Floor | None, float], World]
 
 
 class Loop(NamedTuple):
-    """All of the driven half between two ticks."""
+    """The state of a `Simulator` between two ticks."""
 
     tick: Scalar
     state: Any  # the world's
     sensors: all_sensors.SensorMemory
     up: Packets | None  # None: the pilot is on board
     down: Packets | None
-    faulty: Readings | None = None  # what failing sensors have reported; None: none ever fails
+    faulty: Readings | None = None  # last reports with their faults; None: there are no faults
 
     @property
     def readings(self) -> Readings:
@@ -59,7 +59,7 @@ class Loop(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is kept of a tick: the state at its start, and the command that the car runs in it."""
+    """The record of a tick: the state at its start, and the command that the car executes in it."""
 
     tick: Scalar
     motion: Motion
@@ -69,18 +69,18 @@ class Record(NamedTuple):
     readings: Readings
     wall_contacts: Scalar
     rolled_over: Scalar
-    status: Status  # what the driver said it was about, at its start
+    status: Status  # the driver's status at its start
 
 
 @pytree
 class Simulator:
     """A car in a world, with its sensors and its link to the pilot.
 
-    The precision is that of the car's leaves: 64-bit leaves run in 64 bits. `of` makes one.
+    Its precision is that of the car's leaves: 64-bit leaves run in 64 bits. `of` constructs it.
     """
 
     world: World
-    walls: Array  # (n, 4) that sensors see, padded with rows of NaN
+    walls: Array  # (n, 4), for the sensors, padded with rows of NaN
     corners: Array  # (2n, 3), from `sonar.edges`
     pose: tuple[Scalar, Scalar, Scalar]  # at the start: x, y, heading
     velocity: tuple[Scalar, Scalar, Scalar]  # vx, vy, yaw rate
@@ -89,7 +89,7 @@ class Simulator:
     faults: tuple[SensorFault, ...]
     link: Link = dataclasses.field(metadata={"static": True})
     every: all_sensors.Periods = dataclasses.field(metadata={"static": True})
-    slots: int = dataclasses.field(metadata={"static": True})  # poses kept for a late sensor
+    slots: int = dataclasses.field(metadata={"static": True})  # poses kept for the position's delay
 
     @classmethod
     def of(
@@ -109,8 +109,8 @@ class Simulator:
     ) -> "Simulator":
         """A car on a course (None: open floor), at the course's start unless `start` is given.
 
-        `floor` is where friction varies from place to place; `world` makes the physics. Raises
-        `InputError` for a fault of a sensor that the car has not.
+        `floor` gives friction that varies with position. `world` makes the physics. Raises
+        `InputError` if a fault has an unknown kind or a sensor that the car lacks.
         """
         failing.check(faults, car)
         dtype = np.asarray(car.body.mass).dtype
@@ -132,7 +132,7 @@ class Simulator:
 
     @property
     def car(self) -> Car:
-        """The car that is driven."""
+        """The simulated car."""
         return self.world.car
 
     @property
@@ -142,36 +142,36 @@ class Simulator:
 
     @property
     def dtype(self) -> Any:
-        """The precision that it runs in."""
-        # Not `jnp.result_type`: it says 32 bits of all that 64 bits are not switched on for.
+        """The precision of the simulation."""
+        # Not `jnp.result_type`: it returns 32 bits unless 64 bits are enabled.
         return np.dtype(getattr(self.car.body.mass, "dtype", np.float64))
 
     @property
     def root(self) -> jax.Array:
-        """The key that all of a drive's draws derive from."""
+        """The random key of the drive. All keys of its draws derive from it."""
         return random_streams.root(self.seed)
 
     def init(self) -> Loop:
-        """Before the first tick."""
+        """The state before the first tick."""
         with self._precision():
             return begin(self)
 
     def readings(self, loop: Loop) -> Readings:
-        """What has reached the pilot; and the ground truth, for the estimator `truth` alone."""
+        """The readings that have reached the pilot. `truth` is for the estimator `truth` only."""
         return heard(self, loop)
 
     def apply(self, loop: Loop, command: Command, ticks: int) -> tuple[Loop, Record]:
-        """So many ticks later, with the command given at the first and held.
+        """Advance by `ticks`, with the command given at the first one and held.
 
-        The record has a leading axis of ticks. Over a radio, commands leave at the link's pace.
+        The record has a leading axis of ticks. A radio sends commands at its own period.
         """
         with self._precision():
             return _apply(self, ticks, loop, command)
 
     def run(self, pilot: Pilot, longest: float) -> Generator[Record, None, None]:
-        """Drives for at most so many seconds: the records of half a second each.
+        """Drive for `longest` seconds, rounded up to whole pieces of about `PIECE` seconds.
 
-        Whoever reads the pieces may stop when the goal is reached.
+        Yields the record of each piece. The caller may stop early, such as at the goal.
         """
         pilot = pilot.typed(self.dtype)
         ticks = max(1, round(PIECE / self.dt / pilot.control)) * pilot.control
@@ -184,11 +184,11 @@ class Simulator:
                 with self._precision():
                     loop, memory, record = piece(self, pilot, ticks, loop, memory)
             except BaseException:
-                # What was driven before a driver failed is not lost.
+                # If the driver fails, the record before this piece is not lost.
                 if before is not None:
                     yield jax.tree.map(np.asarray, before)
                 raise
-            # This piece is computed while the one before it is read.
+            # This piece is computed while the caller reads the one before it.
             if before is not None:
                 yield jax.tree.map(np.asarray, before)
             before = record
@@ -196,7 +196,7 @@ class Simulator:
             yield jax.tree.map(np.asarray, before)
 
     def record(self, pilot: Pilot, longest: float) -> Record:
-        """The whole of `run` at once, cut off at `longest`: for drives of seconds to minutes."""
+        """All records of `run` in one, cut off at `longest` seconds. For drives up to minutes."""
         last, pieces = round(longest / self.dt), self.run(pilot, longest)
         return jax.tree.map(lambda *parts: np.concatenate(parts)[:last], *pieces)
 
@@ -274,7 +274,7 @@ def _apply(simulator: Simulator, ticks: int, loop: Loop, command: Command) -> tu
     def one(loop: Loop, _: None) -> tuple[Loop, Record]:
         return advance(simulator, loop, command, loop.tick == first)
 
-    # A scan of one tick would be unrolled, and compiled to other last digits than one of many.
+    # A scan of one tick would be unrolled. Its last digits would differ from a longer scan's.
     shapes = jax.eval_shape(one, loop, None)[1]
     lines = jax.tree.map(lambda leaf: jnp.zeros((ticks, *leaf.shape), leaf.dtype), shapes)
 
@@ -297,7 +297,7 @@ def tick(
         return pilot.act(memory, heard(simulator, loop), loop.tick)[1]
 
     status = pilot.status(memory)
-    # Also where each tick has a decision: what is compiled apart comes to the same digits.
+    # Traced even if each tick has a decision: code compiled apart gives the same digits.
     now = loop.tick % pilot.control == 0 if pilot.control > 1 else loop.tick >= 0
     memory = jax.lax.cond(now, act, lambda same: same, memory)
     loop, record = advance(simulator, loop, memory.command, now)
@@ -308,7 +308,7 @@ def tick(
 def scan(
     simulator: Simulator, pilot: Pilot, ticks: int, loop: Loop, memory: PilotMemory
 ) -> tuple[Loop, PilotMemory, Record]:
-    """So many ticks with a pilot that JAX can trace."""
+    """Run `ticks` ticks with a pilot that JAX can trace."""
 
     def one(carry: tuple[Loop, PilotMemory], _: None) -> tuple[tuple[Loop, PilotMemory], Record]:
         loop, memory, record = tick(simulator, pilot, *carry)
@@ -321,7 +321,7 @@ def scan(
 def steps(
     simulator: Simulator, pilot: Pilot, ticks: int, loop: Loop, memory: PilotMemory
 ) -> tuple[Loop, PilotMemory, Record]:
-    """The same with any pilot, a decision at a time."""
+    """`scan` for any pilot, one decision at a time."""
     records = []
     for _ in range(ticks // pilot.control):
         status = pilot.status(memory)

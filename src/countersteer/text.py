@@ -1,4 +1,4 @@
-"""Text files that a person hands in, and the TOML files of the project."""
+"""Text files of the user, and the TOML files of the project."""
 
 import tomllib
 from collections.abc import Mapping
@@ -10,14 +10,14 @@ import tomli_w
 from countersteer.errors import InputError
 
 MOST = 256  # MB; an hour of commands at 1 kHz is 150
-LARGEST_TOML = 10  # MB of a file that a person writes
+LARGEST_TOML = 10  # MB, of a file that is written by hand
 FORMAT = 1  # of the files that this version writes, and the latest that it reads
 
 
 def read_text(path: Path, most: float = MOST) -> str:
-    """The text of a file of at most so many MB, in UTF-8.
+    """The UTF-8 text of a file of at most `most` MB.
 
-    Raises `InputError` where it is larger (a device has no end), no text, or cannot be read.
+    Raises `InputError` if the file is larger (a device has no end), is not text or is unreadable.
     """
     limit = int(most * 1e6)
     try:
@@ -34,10 +34,10 @@ def read_text(path: Path, most: float = MOST) -> str:
 
 
 def read_toml(name: str, shelf: Any, kind: str, files: str = ".toml") -> tuple[dict[str, Any], str]:
-    """The tables of a library entry or of a file's path, and what to call them in messages.
+    """The tables of a library entry or of a file, and their name in messages.
 
-    Raises `InputError` where there is none (it says which `files` may be given), where it is no
-    TOML, or where it is of a later format.
+    Raises `InputError` if there is none (the message names the allowed `files`), if it is not
+    TOML, or if its format is later than `FORMAT`.
     """
     entry = shelf / f"{name}.toml"
     path = Path(name)

@@ -1,4 +1,4 @@
-"""`Car`: everything that is known about a car, as a frozen pytree of declared parameters."""
+"""`Car`: all declared parameters of a car, as a frozen pytree."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ COMMONROAD = "CommonRoad vehicle models 3.0.2, tyre of its vehicles"
 
 @pytree
 class Body:
-    """The rigid body, its outline, and how its weight rests on the wheels."""
+    """The rigid body: mass, outline, load transfer and impacts."""
 
     mass: Scalar = parameter(1.5, "kg", 0.02, 3000, "mass of the whole car")
     yaw_inertia: Scalar = parameter(
@@ -44,8 +44,8 @@ class Body:
 class MagicFormula:
     """Coefficients of a Magic Formula tyre without camber, by their names in the literature.
 
-    p: pure slip, r: combined; c shape, d peak, e curvature, k stiffness, b steepness, h and v
-    shifts; x along the wheel, y across. The defaults are those of a passenger car.
+    p: pure slip, r: combined slip. c: shape, d: peak, e: curvature, k: stiffness, b: steepness,
+    h and v: shifts. x: along the wheel, y: across. The defaults are those of a passenger car.
     """
 
     p_cx1: Scalar = parameter(1.6411, "1", 0.1, 3, "shape, along", COMMONROAD)
@@ -79,7 +79,7 @@ class MagicFormula:
 
 @pytree
 class Tire:
-    """The wheels and tyres of one axle. Stiffness is per unit of load, so N/N per rad."""
+    """The wheels and tyres of one axle. Stiffness is per unit of load: N/N per rad."""
 
     law: str = choice(
         "brush",
@@ -119,7 +119,7 @@ class Tire:
 
     @property
     def peak_friction(self) -> Scalar:
-        """The largest force across the wheel over the load."""
+        """The largest force across the wheel, divided by the load."""
         if self.law == "magic-formula":
             return self.magic_formula.p_dy1
         return self.friction * (4 - 3 * self.sliding_ratio) / (3 - 2 * self.sliding_ratio) ** 2
@@ -135,9 +135,9 @@ class Tires:
 
 @pytree
 class Drivetrain:
-    """From the motor's shaft to the wheels: three differentials and drag.
+    """The drivetrain from motor shaft to wheels: three differentials and drag.
 
-    A lock of 0 is an open differential, of 1 a solid shaft; between them it is a viscous coupling.
+    A lock of 0 is an open differential, 1 a solid shaft. Between them it is a viscous coupling.
     """
 
     front_share: Scalar = parameter(
@@ -192,7 +192,7 @@ class Motor:
 
 @pytree
 class Battery:
-    """A pack whose voltage sags with current and age and falls as it runs down."""
+    """A pack. Its voltage sags with current, more so with wear, and falls as it discharges."""
 
     full: Scalar = parameter(9.6, "V", 0.5, 1000, "open-circuit voltage, fully charged")
     slope: Scalar = parameter(
@@ -211,7 +211,7 @@ class Battery:
 
 @pytree
 class Servo:
-    """From the angle asked for to the angle of the front wheels."""
+    """The steering: from the commanded angle to the angles of the front wheels."""
 
     gain_left: Scalar = parameter(1.0, "1", 0.1, 5, "angle got per angle asked, to the left")
     gain_right: Scalar = parameter(1.0, "1", 0.1, 5, "angle got per angle asked, to the right")
@@ -231,7 +231,7 @@ class Servo:
 
 @pytree
 class Mount:
-    """Where a sonar sits."""
+    """Position and direction of a sonar."""
 
     x: Scalar = parameter(0.0, "m", -5, 5, "forward of the centre of mass")
     y: Scalar = parameter(0.0, "m", -3, 3, "left of the centre of mass")
@@ -240,7 +240,7 @@ class Mount:
 
 @pytree
 class Sonar:
-    """All sonars of a car are of one kind."""
+    """The sonars of a car, all of one kind."""
 
     mount_names: tuple[str, ...] = dataclasses.field(
         default=("front", "left", "right"), metadata={"static": True}
@@ -272,7 +272,7 @@ class Sonar:
 
 @pytree
 class Encoder:
-    """Black and white regions on a wheel or shaft, counted without direction."""
+    """Counts black and white regions on a wheel or shaft, without their direction."""
 
     regions: Scalar = parameter(
         10.0, "1", 1, 10000, "black regions on the disc, and as many white ones", "paper, II.D"
@@ -319,7 +319,7 @@ class Voltmeter:
 
 @pytree
 class LineDetector:
-    """An eye on the floor, which bears lines at a known spacing along the world's x axis."""
+    """An eye that detects lines on the floor. Their spacing along the world's x axis is known."""
 
     lines: str = choice(
         "none",
@@ -333,7 +333,7 @@ class LineDetector:
 
 @pytree
 class Lidar:
-    """A laser that looks along many beams at one instant. Off (0 beams) by default."""
+    """A laser that measures along many beams at one instant. Off (0 beams) by default."""
 
     beams: int = count(
         0, 0, 2000, "beams, each in the middle of its part of the field; 0: no lidar"
@@ -350,7 +350,7 @@ class Lidar:
 
 @pytree
 class Position:
-    """Place from outside: of the centre of mass, in the world's axes. Off by default."""
+    """Position of the centre of mass in the world's axes, measured externally. Off by default."""
 
     reports: str = choice(
         "none",
@@ -365,7 +365,7 @@ class Position:
 
 @pytree
 class Sensors:
-    """What the car carries to sense with."""
+    """The sensors of a car."""
 
     sonar: Sonar = Sonar()
     encoder: Encoder = Encoder()
@@ -391,6 +391,6 @@ class Car:
 
 
 def wheel_positions(body: Body) -> tuple[Wheels, Wheels]:
-    """Where the wheels stand: x forward and y left of the centre of mass (m)."""
+    """Positions of the wheels: x forward and y left of the centre of mass (m)."""
     front, rear, half = body.front_axle, body.front_axle - body.wheelbase, body.track / 2
     return Wheels(front, front, rear, rear), Wheels(half, -half, half, -half)

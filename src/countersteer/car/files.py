@@ -52,7 +52,7 @@ def load_car(name: str, overrides: Iterable[str] = ()) -> Car:
 
 
 def check(car: Car, where: str) -> None:
-    """What must hold between parameters. Raises `InputError`."""
+    """Check the constraints between parameters. Raises `InputError`."""
     body = car.body
     if not body.front_axle < body.wheelbase:
         raise InputError(f"{where}: body.front_axle_m must be less than body.wheelbase_m")
@@ -66,7 +66,7 @@ def check(car: Car, where: str) -> None:
 
 
 def _load(name: str, seen: tuple[Path, ...]) -> Car:
-    """A car with its bases; `seen` holds the files that led to it."""
+    """A car with its bases. `seen` holds the files on the way to it, to reject a cycle."""
     tables, where = read_toml(name, LIBRARY, "car")
     base, source = tables.pop("base", None), tables.pop("source", {})
     if not isinstance(source, dict):
@@ -86,7 +86,7 @@ def _load(name: str, seen: tuple[Path, ...]) -> Car:
 
 
 def _merge(part: Any, table: Any, where: str, path: str) -> Any:
-    """`part` with the values of a table in place of its own."""
+    """`part` with its values replaced by those of a table. Raises `InputError`."""
     if not isinstance(table, dict):
         raise InputError(f"{where}: {path.rstrip('.')} must be a table of parameters")
     known = declarations(type(part))
@@ -110,7 +110,7 @@ def _merge(part: Any, table: Any, where: str, path: str) -> Any:
 
 
 def _mounts(sonar: Sonar, table: Any, where: str, path: str) -> dict[str, Any]:
-    """Sonar mounts by name; a table of mounts adds to those that are there."""
+    """The sonar's mounts, with the mounts of a table added or changed by name."""
     if not isinstance(table, dict):
         raise InputError(f"{where}: {path.rstrip('.')} must be a table of mounts")
     mounts = dict(zip(sonar.mount_names, sonar.mounts, strict=True))
@@ -120,7 +120,7 @@ def _mounts(sonar: Sonar, table: Any, where: str, path: str) -> dict[str, Any]:
 
 
 def car_tables(part: Any) -> dict[str, Any]:
-    """A car in full, as the tables of a file."""
+    """All of a car as the tables of a file. Brush tyres have no `magic_formula`."""
     table: dict[str, Any] = {
         key: write_value(declared, getattr(part, name))
         for key, (name, declared) in declarations(type(part)).items()
@@ -147,16 +147,16 @@ def car_from_tables(tables: dict[str, Any], where: str) -> Car:
 
 
 def save_car(car: Car, path: Path, source: dict[str, str]) -> None:
-    """Write a car in full. `source` says where each number is from."""
+    """Write all of a car. `source` says where each number is from."""
     path.write_text(toml_of({"source": source, **car_tables(car)}))
 
 
 def parameters(car: Car | None = None) -> list[dict[str, Any]]:
-    """Every parameter of a car as it stands at an edge, in the order of declaration.
+    """Every parameter of a car in the units of files, in the order of declaration.
 
-    `path` is what `--set` takes, `value` is the car's, `low` and `high` are its range (None where
-    there are `choices` instead), `source` is that of the default, `unit` that of all its numbers.
-    Without a car the values are the defaults, and sonars go by NAME.
+    `path` is as in `--set`, `value` is the car's, `low` and `high` are its range (None if it has
+    `choices`), `source` is that of the default, and `unit` that of all its numbers. Without a
+    car, values are the defaults, and the one sonar mount is called NAME.
     """
     plain = Sonar(mount_names=("NAME",), mounts=(Mount(),))
     return _parameters(car or Car(sensors=Sensors(sonar=plain)), "")
@@ -167,7 +167,7 @@ def _parameters(part: Any, path: str) -> list[dict[str, Any]]:
     for key, (name, declared) in declarations(type(part)).items():
         default = getattr(type(part)(), name)
         value, default, low, high = (
-            # Degrees that were radians in between lose their last digits.
+            # The conversion to radians and back changes the last digits.
             v if declared.choices else float(f"{write_value(declared, v):.12g}")
             for v in (getattr(part, name), default, declared.low, declared.high)
         )

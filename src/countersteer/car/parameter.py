@@ -17,7 +17,7 @@ from countersteer.signals import Scalar
 
 T = typing.TypeVar("T")
 
-# Unit inside -> (suffix of the name at every edge, what one unit outside is inside).
+# Internal unit -> (suffix of the name at every edge, factor from the edge's unit to it).
 EDGE = {
     "1": ("", 1.0),
     "1/N": ("_pn", 1.0),
@@ -43,7 +43,7 @@ EDGE = {
 
 @dataclasses.dataclass(frozen=True)
 class Declaration:
-    """What is known about a parameter: `low` and `high` in the unit used inside."""
+    """The declaration of a parameter. `low` and `high` are in its internal unit."""
 
     unit: str
     low: float
@@ -57,27 +57,27 @@ class Declaration:
 def parameter(
     default: float, unit: str, low: float, high: float, meaning: str, source: str = "assumed"
 ) -> Any:
-    """Declare a number: default and range in the unit that files use (degrees, not radians)."""
+    """Declare a number. Default and range are in the unit of files (degrees, not radians)."""
     factor = EDGE[unit][1]
     declared = Declaration(unit, low * factor, high * factor, meaning, source)
     return dataclasses.field(default=default * factor, metadata={"declared": declared})
 
 
 def count(default: int, low: int, high: int, meaning: str, source: str = "assumed") -> Any:
-    """Declare a whole number that is the size of something; it is static under `jit`."""
+    """Declare a whole number, such as an array's size. It is static under `jit`."""
     declared = Declaration("1", low, high, meaning, source, whole=True)
     return dataclasses.field(default=default, metadata={"declared": declared, "static": True})
 
 
 def choice(default: str, choices: tuple[str, ...], meaning: str, source: str = "assumed") -> Any:
-    """Declare a setting with a name for a value; it is static under `jit`."""
+    """Declare a setting with named values. It is static under `jit`."""
     declared = Declaration("1", 0.0, 0.0, meaning, source, choices)
     return dataclasses.field(default=default, metadata={"declared": declared, "static": True})
 
 
 @typing.dataclass_transform(frozen_default=True, kw_only_default=True)
 def pytree(cls: type[T]) -> type[T]:
-    """Make a class a frozen dataclass and a pytree; fields with `static` are not leaves."""
+    """Make a class a frozen dataclass and a pytree. Fields with `static` are not leaves."""
     made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
     static = [f.name for f in dataclasses.fields(made) if f.metadata.get("static")]
     data = [f.name for f in dataclasses.fields(made) if f.name not in static]
@@ -97,7 +97,7 @@ def declarations(part: type) -> dict[str, tuple[str, Declaration]]:
 
 
 def read_value(where: str, key: str, declared: Declaration, value: Any) -> Any:
-    """A value from a file or the command line, checked and in the unit used inside.
+    """A value from a file or the command line, checked and in its internal unit.
 
     Raises `InputError` with the place, the key and the range.
     """
@@ -133,7 +133,7 @@ def edge_unit(declared: Declaration) -> str:
 def changed(part: T, path: str, value: Scalar) -> T:
     """`part` with one parameter replaced, such as `tires.rear.friction` of a car.
 
-    `path` holds names inside and `value` is in the unit used inside, unchecked; it may be traced.
+    `path` holds field names. `value` is in the internal unit. It is unchecked and may be traced.
     """
     name, _, rest = path.partition(".")
     value = changed(getattr(part, name), rest, value) if rest else value
@@ -142,7 +142,7 @@ def changed(part: T, path: str, value: Scalar) -> T:
 
 
 def unknown_key(where: str, key: str, known: Mapping[str, Any]) -> InputError:
-    """The error for a key that nothing declares, with the nearest ones that something does."""
+    """The error for an undeclared key. It names the nearest declared key, or else all."""
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
     return InputError(f"{where}: unknown key {key}{hint}")

@@ -1,1 +1,1 @@
-"""What lies between a driver and a car: rate, delay and loss."""
+"""The link between a driver and a car: rate, delay and loss."""

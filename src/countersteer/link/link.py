@@ -1,4 +1,4 @@
-"""Links: a driver on board, or at the far end of a radio."""
+"""Links between driver and car: on board, or by radio."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from countersteer.signals import Array, Scalar
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """Times in seconds. Static: a program is compiled for a link."""
+    """A link. Times are in seconds. It is static: each link has its own compiled program."""
 
     name: str
     control_period: float  # between two commands of the driver
@@ -21,10 +21,10 @@ class Link:
     onboard: bool
     delay: float = 0.0  # of a packet, either way
     loss: float = 0.0  # chance that a packet is lost, either way
-    timeout: float = math.inf  # a car that hears nothing for so long stops
+    timeout: float = math.inf  # without a packet for so long, the car's throttle goes to 0
 
     def in_ticks(self, dt: float) -> "Ticks":
-        """The same in whole ticks of dt seconds, at least one each."""
+        """The times in ticks of dt seconds. Periods and a finite timeout are at least one tick."""
 
         def ticks(time: float) -> int:
             return max(1, round(time / dt))
@@ -39,7 +39,7 @@ class Link:
 
 
 class Ticks(NamedTuple):
-    """A link's times in ticks; hashable, as a program is compiled for them."""
+    """A link's times in ticks. Hashable, since a program is compiled for them."""
 
     control: int  # between two commands
     telemetry: int
@@ -55,16 +55,16 @@ LINKS = {link.name: link for link in (ONBOARD, RADIO)}
 
 
 class Packets(NamedTuple):
-    """One direction of a radio: packets on their way, and the last one that arrived."""
+    """One direction of a radio: packets in flight, and the last one that arrived."""
 
-    packets: Any  # a pytree whose leaves have a slot a packet in front
+    packets: Any  # a pytree; the first axis of its leaves is one slot per packet
     lost: Array
     latest: Any
     arrived: Scalar  # tick of the last arrival; -1 before the first
 
 
 def initial_packets(packet: Any, period: int, delay: int) -> Packets:
-    """Nothing on its way; `packet` is what its far end assumes until it hears."""
+    """No packet in flight. The receiver assumes `packet` until the first arrival."""
     slots = delay // period + 2
     packets = jax.tree.map(lambda leaf: np.stack([leaf] * slots), packet)
     return Packets(packets, np.ones(slots, bool), packet, np.int32(-1))
@@ -73,7 +73,7 @@ def initial_packets(packet: Any, period: int, delay: int) -> Packets:
 def exchange(
     air: Packets, packet: Any, lost: Scalar, tick: Scalar, period: int, delay: int
 ) -> Packets:
-    """One tick: sends `packet` where one is due, and delivers the one that is due."""
+    """One tick: send `packet` if one is due, and deliver the packet whose delay is over."""
     slots = air.lost.shape[0]
     sends = tick % period == 0
     into = (tick // period) % slots

@@ -1,1 +1,1 @@
-"""Sensors: truth in, what the real part would report out."""
+"""Sensors: ground truth in, reports of the real part out."""

@@ -19,11 +19,11 @@ from countersteer.world.chassis import Vector
 
 POSITION = ("position_x", "position_y", "position_heading")
 LARGEST_COUNT = 65535.0  # of a counter of 16 bits
-FASTEST = 20.0  # m/s that a wheel or the lines may seem to tell
+FASTEST = 20.0  # m/s, largest declared speed of a wheel and of the line detector
 
 
 def channels(car: Car) -> Readings:
-    """What the car reports: a `Channel` in place of each reading. The car may be traced."""
+    """The car's channels: a `Channel` in place of each reading. The car may be traced."""
     part, inf, pi = car.sensors, math.inf, math.pi
     near, far, volts = part.sonar.nearest, part.sonar.reach, 2 * car.battery.full
     spin, push = part.gyroscope.reach, part.accelerometer.reach
@@ -74,7 +74,7 @@ class Periods(NamedTuple):
 
 
 def number(every: Fraction, tick: Scalar) -> Scalar:
-    """How many reports were due until this tick."""
+    """Number of reports that are due up to this tick."""
     return tick * every.denominator // every.numerator
 
 
@@ -84,19 +84,19 @@ def due(every: Fraction, tick: Scalar) -> Scalar:
 
 
 class SensorMemory(NamedTuple):
-    """What the sensors carry from tick to tick."""
+    """The state of the sensors between two ticks."""
 
     readings: Readings
-    disc: Scalar  # place of the eye within a region of the encoder's disc, 0 to 1
+    disc: Scalar  # position of the eye within a region of the encoder's disc, 0 to 1
     counts: Scalar
     counts_before: Scalar  # at the last report
     velocity: Vector  # at the accelerometer's last report
-    eye: Scalar | None  # place of the line detector's eye (m)
-    poses: Array | None = None  # (delay in ticks + 1, 3), a slot a tick: what position is to tell
+    eye: Scalar | None  # `error_models.eye` of the line detector (m)
+    poses: Array | None = None  # (delay in ticks + 1, 3), one slot a tick, for `position`
 
 
 def periods(car: Car, dt: float) -> Periods:
-    """Each sensor's period; none reports more than once a tick."""
+    """Each sensor's period, at least one tick."""
     sensors = car.sensors
     times = (
         1 / sensors.sonar.rate,
@@ -116,12 +116,12 @@ def periods(car: Car, dt: float) -> Periods:
 
 
 def position_slots(car: Car, dt: float) -> int:
-    """Ticks of poses that are kept until they are told; of many cars, for the latest."""
+    """Number of poses to keep for the position's delay. In a batch, for the longest delay."""
     return round(float(np.max(car.sensors.position.delay)) / dt) + 1
 
 
 def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None) -> SensorMemory:
-    """Sensors that have not reported yet. `slots` default to the car's `position_slots`."""
+    """Sensors before their first report. `slots` defaults to the car's `position_slots`."""
     dtype = jnp.result_type(motion.x).type
     zero, none = dtype(0), Reading(dtype(0), np.int32(-1))
     no_echo = none._replace(value=dtype(np.inf))
@@ -147,7 +147,7 @@ def initial_memory(car: Car, motion: Motion, dt: float, slots: int | None = None
 
 
 class Now(NamedTuple):
-    """What a sensor's report is made from."""
+    """The input of a sensor's report."""
 
     car: Car
     walls: jax.Array
@@ -185,7 +185,7 @@ def sense(
     every: Periods,
     dt: float,
 ) -> SensorMemory:
-    """The sensors after a tick. Noise is drawn once a reading, from the drive's key `root`."""
+    """The sensors after a tick. Noise is drawn once per reading, from the drive's key `root`."""
     sensors = car.sensors
     shaft = drivetrain.driven_speed(car, motion.wheels)
     speed = error_models.disc_speed(sensors.encoder, motion.wheels, shaft)
@@ -228,7 +228,7 @@ def sense(
 
 
 def report_sonar(turn: Scalar, now: Now, readings: Readings) -> Readings:
-    """A ping of all mounts, or of the one whose `turn` it is."""
+    """A ping of all mounts. If they fire in turn, only of the mount with index `turn`."""
     part, dtype = now.car.sensors.sonar, jnp.result_type(now.motion.x)
     fires: tuple[jax.Array, ...] = (jnp.asarray(1.0),) * len(part.mounts)
     if part.firing == "in-turn":
@@ -253,9 +253,9 @@ def report_gyroscope(now: Now, readings: Readings) -> Readings:
 
 
 def report_accelerometer(now: Now, readings: Readings) -> Readings:
-    """The mean acceleration since the last report, turning included.
+    """The mean acceleration since the last report, with the part from the yaw rate.
 
-    Of the turning too: otherwise a turn that begins would be felt early.
+    That part is averaged too. With its latest value, the start of a turn would show early.
     """
     before, motion, time = now.memory.velocity, now.motion, now.since(readings.accel_x)
     ax = (motion.vx - before.x) / time - (before.yaw * before.y + motion.yaw_rate * motion.vy) / 2
@@ -266,7 +266,7 @@ def report_accelerometer(now: Now, readings: Readings) -> Readings:
 
 
 def report_encoder(now: Now, readings: Readings) -> Readings:
-    """Counts, and the wheel speed that the counts since the last report make."""
+    """Counts, and the wheel speed from the counts since the last report."""
     part, tires, memory = now.car.sensors.encoder, now.car.tires, now.memory
     radius = tires.rear.radius if "rear" in part.on else tires.front.radius
     time = now.since(readings.wheel_speed)
@@ -288,7 +288,7 @@ def report_voltmeter(now: Now, readings: Readings) -> Readings:
 
 
 def report_lidar(now: Now, readings: Readings) -> Readings:
-    """A scan."""
+    """One scan of the lidar."""
     part = now.car.sensors.lidar
     noise = now.noise(Stream.LIDAR, (part.beams,))
     return readings._replace(
@@ -297,7 +297,7 @@ def report_lidar(now: Now, readings: Readings) -> Readings:
 
 
 def report_position(now: Now, readings: Readings) -> Readings:
-    """The pose of `delay` ago."""
+    """The pose at one `delay` before this tick."""
     poses = now.memory.poses
     assert poses is not None
     noise = now.noise(Stream.POSITION, (3,))
@@ -315,9 +315,9 @@ def report_position(now: Now, readings: Readings) -> Readings:
 def cross(
     car: Car, readings: Readings, before: Scalar, eye: Scalar, tick: Scalar, dt: float
 ) -> Readings:
-    """The line detector after a tick. It looks every tick, and reports when it enters a line.
+    """The line detector after a tick. It checks every tick, and reports when it enters a line.
 
-    The first line gives no speed. Speed is blind to direction, and wrong where the car turned back.
+    The first line gives no speed. The speed has no sign. It is wrong if the car turned back.
     """
     part, last, speed = car.sensors.line_detector, readings.line_crossings, readings.line_speed
     assert last is not None

@@ -1,4 +1,4 @@
-"""Parts that read a number now and then: encoder, gyroscope, accelerometer and so on."""
+"""Error models of encoder, gyroscope, accelerometer, voltmeter, position and line detector."""
 
 import jax
 import jax.numpy as jnp
@@ -15,24 +15,24 @@ from countersteer.signals import Scalar, Wheels
 
 
 def quantised(value: Scalar, step: Scalar) -> Scalar:
-    """The value on the grid of a converter; a step of 0 is no grid."""
+    """The value rounded to a multiple of `step`. A step of 0 does not round."""
     return jnp.where(step > 0, jnp.round(value / jnp.maximum(step, 1e-12)) * step, value)
 
 
 def disc_speed(encoder: Encoder, wheels: Wheels, shaft: Scalar) -> Scalar:
-    """Speed of what the encoder sits on (rad/s)."""
+    """Speed of the encoder's disc, on a wheel or the shaft (rad/s)."""
     if encoder.on == "shaft":
         return shaft
     return wheels[("front-left", "front-right", "rear-left", "rear-right").index(encoder.on)]
 
 
 def regions_per_second(encoder: Encoder, speed: Scalar) -> Scalar:
-    """Regions that pass the eye, black and white, at a disc's speed (rad/s)."""
+    """Black and white regions that pass the eye per second, at a disc's speed (rad/s)."""
     return speed * encoder.regions / jnp.pi
 
 
 def wheel_speed(encoder: Encoder, radius: Scalar, counts: Scalar, time: Scalar) -> Scalar:
-    """Speed (m/s) for regions counted over a time: the step is pi R / (N time), never negative."""
+    """Wheel speed (m/s), at least 0, from regions counted over a time. Step: pi R / (N time)."""
     return counts * jnp.pi / encoder.regions * radius / time
 
 
@@ -68,14 +68,14 @@ def position(part: Position, pose: jax.Array, noise: jax.Array) -> tuple[Scalar,
 
 
 def eye(part: LineDetector, x: Scalar, heading: Scalar) -> Scalar:
-    """Where the eye of a car at x with a heading is along the lines' axis (m)."""
+    """Position (m) of the eye along the world's x axis, for a car at x with this heading."""
     return x + part.x * jnp.cos(heading)
 
 
 def lines_entered(part: LineDetector, before: Scalar, now: Scalar) -> Scalar:
-    """How many lines the eye has entered on its way from one place to another (m).
+    """Number of lines that the eye enters between two positions (m).
 
-    It enters each at the edge that it meets first; turning round on a line it enters none.
+    It enters a line at the edge that it meets first. If it turns back on a line, it enters none.
     """
     edge = jnp.where(now > before, 0.5, -0.5) * part.width
     cells = [jnp.floor((place + edge) / part.spacing) for place in (before, now)]

@@ -1,4 +1,4 @@
-"""Sensors that fail for a while: dead, stuck, or spiking."""
+"""Sensor faults for a limited time: dead, stuck or spike."""
 
 import math
 from dataclasses import field
@@ -16,25 +16,25 @@ from countersteer.sensing.all_sensors import channels
 from countersteer.signals import Array, Channel, Reading, Readings, Scalar, flat, pairs, unflat
 
 KINDS = ("dead", "stuck", "spike")
-ASTRAY = 10.0  # m by which a place may seem to be off
+ASTRAY = 10.0  # m, largest error of a spike in a position
 
 
 @pytree
 class SensorFault:
-    """What happens to the readings that a sensor takes within a window of time.
+    """A fault of the readings of a sensor within a window of time.
 
-    dead: there are none. stuck: each repeats the last one before the window, as a new one. spike:
-    each is a number drawn evenly from all that such a sensor may tell (a place: from 10 m around).
+    dead: there are no readings. stuck: each repeats the last one before the window, as a new one.
+    spike: each is drawn uniformly from the channel's range (a position: within 10 m of it).
     """
 
-    sensor: str = field(metadata={"static": True})  # as its `Channel` has it; `sonar`: all of them
-    kind: str = field(metadata={"static": True})  # of KINDS
+    sensor: str = field(metadata={"static": True})  # as in its `Channel`; `sonar`: all sonars
+    kind: str = field(metadata={"static": True})  # one of `KINDS`
     start: Scalar  # s
-    duration: Scalar  # s; inf: for good
+    duration: Scalar  # s; inf: to the end
 
 
 def check(faults: tuple[SensorFault, ...], car: Car) -> None:
-    """Raises `InputError` where the car has no such sensor, or where there is no such fault."""
+    """Raises `InputError` if the car lacks the sensor, or if the kind is not one of `KINDS`."""
     sensors = [channel.sensor for channel in flat(channels(car))]
     known = list(dict.fromkeys((*(["sonar"] if car.sensors.sonar.mounts else []), *sensors)))
     for fault in faults:
@@ -53,9 +53,9 @@ def report(
     tick: Scalar,
     dt: float,
 ) -> Readings:
-    """What is reported after a tick whose readings are `now`, where `last` was reported before it.
+    """The reports after a tick with the readings `now`. `last` are the reports before it.
 
-    Only readings taken in this tick change anything. Spikes are drawn from the drive's key `root`.
+    Only readings of this tick change a report. Spikes are drawn from the drive's key `root`.
     """
     key = random_streams.key(root, Stream.FAULTS, tick)
     time, told = tick * dt, []
@@ -84,9 +84,9 @@ def _choice(condition: Scalar, a: Reading, b: Reading) -> Reading:
 
 
 def spike(channel: Channel, value: Array, key: jax.Array) -> Array:
-    """A reading at random in place of `value`, from the channel's range, or from 10 m around."""
+    """A random value from the channel's range. If that is infinite, from `value` ± `ASTRAY`."""
     low, high = channel.low, channel.high
-    if isinstance(low, float) and math.isinf(low):  # else it may be traced
+    if isinstance(low, float) and math.isinf(low):  # a finite bound may be traced
         low, high = value - ASTRAY, value + ASTRAY
     drawn = jax.random.uniform(key, jnp.shape(value), value.dtype, low, high)
     return jnp.round(drawn) if channel.whole else drawn

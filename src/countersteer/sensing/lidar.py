@@ -7,11 +7,11 @@ from countersteer.car.car import Lidar
 from countersteer.sensing.error_models import quantised
 from countersteer.signals import Array, Scalar
 
-SEAM = 1e-5  # m by which a wall is taken to be longer, so that no beam slips between two
+SEAM = 1e-5  # m added to both ends of a wall, so that no beam passes between two walls
 
 
 def bearings(lidar: Lidar) -> Array:
-    """(beams,): direction of each beam from the car's (rad), from right to left."""
+    """Direction of each beam from straight ahead (rad), from right to left: (beams,)."""
     part = (jnp.arange(lidar.beams) + 0.5) / lidar.beams - 0.5
     return lidar.angle + lidar.field * part
 
@@ -19,9 +19,9 @@ def bearings(lidar: Lidar) -> Array:
 def ranges(
     lidar: Lidar, walls: jax.Array, pose: tuple[Scalar, Scalar, Scalar], noise: Array
 ) -> Array:
-    """(beams,): what each beam of a car at x, y, heading reads, in metres; inf beyond its reach.
+    """Reading of each beam of a car at x, y, heading (m); inf beyond its reach: (beams,).
 
-    `walls` is (n, 4) with rows of NaN as padding, `noise` a standard normal number for each beam.
+    `walls` is (n, 4), with rows of NaN as padding. `noise` is (beams,), standard normal.
     A beam from o along d meets the wall from a along the unit vector w where o + t d = a + s w.
     """
     x, y, heading = pose
@@ -34,7 +34,7 @@ def ranges(
     bearing = (heading + bearings(lidar))[:, None]
     beam_x, beam_y = jnp.cos(bearing), jnp.sin(bearing)
     across = beam_x * wall_y - beam_y * wall_x
-    across = jnp.where(jnp.abs(across) > 1e-9, across, jnp.nan)  # a wall seen from its end is none
+    across = jnp.where(jnp.abs(across) > 1e-9, across, jnp.nan)  # a wall along the beam is not seen
     away = (to_x * wall_y - to_y * wall_x) / across
     place = (to_x * beam_y - to_y * beam_x) / across
     meets = (away >= 0) & (place >= -SEAM) & (place <= length + SEAM)

@@ -11,16 +11,16 @@ from countersteer.car.car import Sonar
 from countersteer.signals import Scalar
 
 PAST = 1e-5  # rad by which a ray passes the end of a wall
-INSIDE = 1e-3  # m of a wall that must show, for it to return an echo
-MERGED = 1e-4  # m within which ends of walls are one corner
-MOST_WALLS = 24  # that a ping reckons with: in its cone, the nearest ones
+INSIDE = 1e-3  # m, margin between an echo's point and the end of a wall
+MERGED = 1e-4  # m, distance within which ends of walls are one corner
+MOST_WALLS = 24  # walls of a ping: the nearest ones in its cone
 
 
 def edges(walls: np.ndarray) -> np.ndarray:
-    """(2n, 3): the ends of all walls, and 1 where such an end can scatter sound, else 0.
+    """Ends x, y of all walls, and 1 if the end can scatter sound, else 0: (2n, 3).
 
-    An end scatters unless it is a seam, where two walls meet in line. The end in an inside corner
-    scatters too: it changes nothing, as the walls beside it are nearer.
+    An end scatters unless it is a seam, where two walls meet in line. An end in an inside corner
+    scatters too. This has no effect, since the walls beside it are nearer.
     """
     ends = np.concatenate([walls[:, :2], walls[:, 2:]])
     along = np.concatenate([walls[:, 2:], walls[:, :2]]) - ends
@@ -42,16 +42,16 @@ def distances(
     fires: tuple[Scalar, ...],
     key: jax.Array,
 ) -> tuple[Scalar, ...]:
-    """What each mount reports after a ping, in metres; inf without an echo.
+    """The report of each mount after a ping (m); inf without an echo.
 
-    `pose` is x, y, heading of the car; `fires` is 1 for each mount that pings. A wall returns an
-    echo from its nearest point within the cone that is seen, at no more than `obliqueness`;
-    `corners` (from `edges`) echo by chance each ping. Whatever a wall hides returns nothing (walls
-    are taken to meet at their ends, if at all). A mount that pings together with others also hears
-    their echoes, at half the way out and back, if they come from within `hearing`.
+    `pose` is x, y, heading of the car. `fires` is 1 for each mount that pings. A wall returns an
+    echo from its nearest visible point within the cone and within `obliqueness` of its normal.
+    `corners` (from `edges`) echo at random in each ping. Hidden points return nothing. Walls are
+    assumed to meet only at their ends. A mount also hears the echoes of other mounts' pings, if
+    they come from within `hearing`. Their distance is half the path out and back.
 
-    A ping reckons with the `MOST_WALLS` nearest walls that may reach into its cone: with all of
-    them, unless there are more within `reach`.
+    A ping uses the `MOST_WALLS` nearest walls that may reach into its cone. These are all such
+    walls, unless more of them are within `reach`.
     """
     x, y, bearing = (jnp.stack(values) for values in zip(*_spots(sonar, pose), strict=True))
     edge_key, noise_key = jax.random.split(key)
@@ -60,7 +60,7 @@ def distances(
     away, echo_x, echo_y = jax.vmap(partial(_echo, sonar, walls, corners[:, :2], lit))(
         x, y, bearing
     )
-    # Rows: who hears; columns: whose ping.
+    # Rows: the mount that hears. Columns: the mount that pings.
     dx, dy = echo_x - x[:, None], echo_y - y[:, None]
     back = jnp.sqrt(dx**2 + dy**2 + 1e-12)
     ahead = jnp.cos(bearing)[:, None] * dx + jnp.sin(bearing)[:, None] * dy
@@ -76,7 +76,7 @@ def distances(
 def _spots(
     sonar: Sonar, pose: tuple[Scalar, Scalar, Scalar]
 ) -> list[tuple[Scalar, Scalar, Scalar]]:
-    """Place and bearing of each mount."""
+    """Position and bearing of each mount."""
     x, y, heading = pose
     cosine, sine = jnp.cos(heading), jnp.sin(heading)
     return [
@@ -98,7 +98,7 @@ def _echo(
     y: Scalar,
     bearing: Scalar,
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Distance and place of the nearest echo of one mount; `lit` is 1 for corners that echo."""
+    """Distance and position of the nearest echo of one mount. `lit` is 1 for corners that echo."""
     if walls.shape[0] > MOST_WALLS:
         near = _nearest(sonar, walls, x, y, bearing)
         both = jnp.concatenate([near, near + walls.shape[0]])
@@ -108,7 +108,7 @@ def _echo(
     along = (end - start) / length[:, None]
     foot = -jnp.sum(start * along, axis=1)  # along the wall, from its start
     away = jnp.abs(start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0])
-    # The piece of the wall's line within the cone: between where its two rays cut it.
+    # The piece of the wall's line that is seen within `obliqueness` of its normal.
     low, high = foot - away * jnp.tan(sonar.obliqueness), foot + away * jnp.tan(sonar.obliqueness)
     normal = start + foot[:, None] * along  # from the sonar to the foot
     ahead_foot = jnp.cos(bearing) * normal[:, 0] + jnp.sin(bearing) * normal[:, 1]
@@ -116,7 +116,7 @@ def _echo(
     ahead_step = jnp.cos(bearing) * along[:, 0] + jnp.sin(bearing) * along[:, 1]
     aside_step = jnp.cos(bearing) * along[:, 1] - jnp.sin(bearing) * along[:, 0]
     slope = jnp.tan(sonar.half_angle)
-    # Within the cone: slope · ahead -+ aside >= 0, each linear along the wall.
+    # Within the cone, slope · ahead -+ aside >= 0. Both are linear along the wall.
     for side in (1.0, -1.0):
         at_foot = slope * ahead_foot + side * aside_foot
         change = slope * ahead_step + side * aside_step
@@ -124,11 +124,11 @@ def _echo(
         low = jnp.where(change > 0, jnp.maximum(low, root), low)
         high = jnp.where(change > 0, high, jnp.minimum(high, root))
     low, high = jnp.maximum(low, 0.0), jnp.minimum(high, length)
-    # Not its very end: where two walls meet, that is seen of one that the other hides.
+    # Not the very end: where two walls meet, the end of a hidden wall would be visible.
     inner = jnp.minimum(INSIDE, (high - low) / 2)
     at = jnp.clip(foot, low + inner, high - inner)
     point = start + at[:, None] * along
-    # Where that point is hidden, the wall may still show beyond the end of what hides it.
+    # If that point is hidden, the wall may still be visible past the end of the nearer wall.
     ends = jnp.concatenate([start, end])
     past = jnp.concatenate([ends + PAST * _left(ends), ends - PAST * _left(ends)])
     span = _cross(past[:, None], (end - start)[None])
@@ -151,7 +151,7 @@ def _echo(
 
 
 def _nearest(sonar: Sonar, walls: jax.Array, x: Scalar, y: Scalar, bearing: Scalar) -> jax.Array:
-    """Which `MOST_WALLS` walls come nearest, of those not all to one side of the cone; in order."""
+    """Sorted indices of the `MOST_WALLS` nearest walls that may reach into the cone."""
     start, end = walls[:, :2] - jnp.stack([x, y]), walls[:, 2:] - jnp.stack([x, y])
     step = end - start
     at = -jnp.sum(start * step, axis=1) / (jnp.sum(step**2, axis=1) + 1e-18)
@@ -164,23 +164,23 @@ def _nearest(sonar: Sonar, walls: jax.Array, x: Scalar, y: Scalar, bearing: Scal
             slope * (cosine * p[:, 0] + sine * p[:, 1]) + side * (cosine * p[:, 1] - sine * p[:, 0])
             for p in (start, end)
         ]
-        # A little beyond the cone, as rays pass the ends of walls.
+        # A little wider than the cone, since rays pass the ends of walls.
         inside = inside & (jnp.maximum(*within) > -0.01)
     return jnp.sort(jax.lax.top_k(jnp.where(inside, -away, -jnp.inf), MOST_WALLS)[1])
 
 
 def _left(vector: jax.Array) -> jax.Array:
-    """Turned by 90° to the left."""
+    """The vectors, turned by 90° to the left."""
     return jnp.stack([-vector[..., 1], vector[..., 0]], axis=-1)
 
 
 def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """The cross product's only component."""
+    """The cross product of two vectors in the plane."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _hidden(start: jax.Array, end: jax.Array, points: jax.Array) -> jax.Array:
-    """Which points, seen from the origin, have a wall before them (not one that they lie on)."""
+    """True for points that a wall hides from the origin. A wall does not hide points on it."""
     ray, a, b = points[:, None], start[None], end[None]
     span = _cross(ray, b - a)
     safe = jnp.where(jnp.abs(span) > 1e-12, span, jnp.inf)

@@ -1,1 +1,1 @@
-"""The physics: one car in plain scalars; a batch is `jax.vmap`, a gradient is `jax.grad`."""
+"""The physics of one car, in scalars. `jax.vmap` gives a batch, `jax.grad` a gradient."""

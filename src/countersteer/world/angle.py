@@ -1,4 +1,4 @@
-"""Cosine and sine as polynomials: calls to a library's are not vectorised in a batch."""
+"""Cosine and sine as polynomials: in a batch, library calls are not vectorised."""
 
 import math
 
@@ -6,14 +6,14 @@ import jax.numpy as jnp
 
 from countersteer.signals import Scalar
 
-# A quarter turn as a sum; thousands of quarters of the first two are exact even in 32 bits.
+# pi/2 as a sum. Thousands of multiples of the first two terms are exact even in 32 bits.
 QUARTER = (1.5703125, 0.0004837512969970703, 7.549789954891882e-08)
 
 
 def cosine_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
-    """The cosine and the sine of an angle (rad), to rounding up to thousands of turns.
+    """Cosine and sine of an angle (rad), exact to rounding up to thousands of turns.
 
-    Whole quarters are taken off, and what is left, at most pi/4, goes into Taylor's series.
+    The nearest multiple of pi/2 is subtracted. The rest, at most pi/4, enters a Taylor series.
     """
     terms = 9 if jnp.result_type(angle) == jnp.float64 else 6
     quarters = jnp.round(angle * (2 / math.pi))
@@ -36,9 +36,10 @@ def cosine_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def cosine(angle: Scalar) -> Scalar:
-    """The cosine alone of an angle (rad), for a third of the work; to rounding within a few turns.
+    """Cosine of an angle (rad), for a third of the work of `cosine_sine`.
 
-    1 - 2 sin²(half the angle), once whole turns are taken off: Taylor's series up to a quarter.
+    It is exact to rounding within a few turns. Whole turns are subtracted. The result is
+    1 - 2 sin²(angle / 2), with a Taylor series of the sine up to pi/2.
     """
     terms = 10 if jnp.result_type(angle) == jnp.float64 else 6
     turns = angle * (1 / (2 * math.pi))

@@ -1,4 +1,4 @@
-"""The rigid body: how its weight rests on the wheels, and its three velocities in a step."""
+"""The rigid body: loads of its wheels, and the linear algebra of its three velocities."""
 
 import math
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from countersteer.signals import Scalar, Wheels
 
 
 class Vector(NamedTuple):
-    """Something along the body's three freedoms: forward, left, yaw."""
+    """A vector over the body's three degrees of freedom: forward, left, yaw."""
 
     x: Scalar
     y: Scalar
@@ -18,9 +18,9 @@ class Vector(NamedTuple):
 
 
 def times(*factors: Scalar) -> Scalar:
-    """The product; nothing to compute where a factor is Python's 0.0, as in a wheel's direction.
+    """The product. It is 0.0 without computation if a factor is Python's 0.0.
 
-    The compiler must keep 0 · x for the sake of NaN.
+    Wheel directions hold such zeros. The compiler cannot drop 0 · x, since x may be NaN.
     """
     if any(isinstance(factor, float) and factor == 0 for factor in factors):
         return 0.0
@@ -28,7 +28,7 @@ def times(*factors: Scalar) -> Scalar:
 
 
 class Symmetric(NamedTuple):
-    """A symmetric 3 x 3 matrix over the body's freedoms."""
+    """A symmetric 3 x 3 matrix over the body's degrees of freedom x, y and w (yaw)."""
 
     xx: Scalar
     yy: Scalar
@@ -38,7 +38,7 @@ class Symmetric(NamedTuple):
     yw: Scalar
 
     def plus(self, weight: Scalar, a: Vector) -> "Symmetric":
-        """With weight · a aᵀ added."""
+        """The matrix plus weight · a aᵀ."""
         return Symmetric(
             self.xx + times(weight, a.x, a.x),
             self.yy + times(weight, a.y, a.y),
@@ -49,7 +49,7 @@ class Symmetric(NamedTuple):
         )
 
     def plus_mixed(self, weight: Scalar, a: Vector, b: Vector) -> "Symmetric":
-        """With weight · (a bᵀ + b aᵀ) added."""
+        """The matrix plus weight · (a bᵀ + b aᵀ)."""
         return Symmetric(
             self.xx + times(2, weight, a.x, b.x),
             self.yy + times(2, weight, a.y, b.y),
@@ -89,19 +89,19 @@ def solve(m: Symmetric, b: Vector) -> Vector:
 
 
 def wheel_loads(body: Body, ax: Scalar, ay: Scalar) -> Wheels:
-    """Load on each wheel (N) while the body accelerates by ax forward and ay left (m/s²).
+    """Load on each wheel (N) at an acceleration of ax forward and ay left (m/s²).
 
-    Moments about the centre of mass, height h, move m h ax / wheelbase from front to rear and
-    m h ay / track from left to right, by `front_roll_share` on the front axle. A wheel that has
-    nothing left to give stays at zero and the other axle takes over, so the loads are never
-    negative and always sum to the weight.
+    With the centre of mass at height h, m h ax / wheelbase moves from front to rear, and
+    m h ay / track from left to right. The front axle takes the part `front_roll_share` of the
+    latter. If a wheel has no load left, the other axle takes over. So the loads are never
+    negative, and their sum is always the weight.
     """
     weight = body.mass * GRAVITY
     behind = body.wheelbase - body.front_axle
     front = (weight * behind - body.mass * body.cm_height * ax) / body.wheelbase
     front = jnp.clip(front, 0.0, weight)
     rear = weight - front
-    # A track of zero is a single-track car: nothing to move between left and right.
+    # A track of zero is a single-track car: no load moves between left and right.
     track = jnp.where(body.track > 0, body.track, 1.0)
     aside = jnp.where(body.track > 0, body.mass * body.cm_height * ay / track, 0.0)
     to_front = jnp.clip(body.front_roll_share * aside, -front / 2, front / 2)
@@ -113,6 +113,6 @@ def wheel_loads(body: Body, ax: Scalar, ay: Scalar) -> Wheels:
 
 
 def pair_in_air(loads: Wheels) -> Scalar:
-    """1 where both wheels of a side or of an axle carry nothing, else 0."""
+    """1 if both wheels of a side or of an axle have no load, else 0."""
     fl, fr, rl, rr = (load <= 0 for load in loads)
     return jnp.where((fl & rl) | (fr & rr) | (fl & fr) | (rl & rr), 1.0, 0.0)

@@ -8,28 +8,35 @@ from countersteer.car.car import Car
 from countersteer.signals import Scalar, Wheels
 from countersteer.world.motor import Drive
 
-COUPLING = 1e-3  # N m s/rad of a differential locked by half
+COUPLING = 1e-3  # N m s/rad, of a differential at lock 0.5
 STANDSTILL = 0.5  # wheel speed (rad/s) below which dry drag fades out
 
 
 class Axle(NamedTuple):
-    """One axle in a step of h: how its wheels answer to torque impulses.
+    """Linear response of an axle's wheel speeds to impulses, in a step of h seconds.
 
-    Wheel speeds after the step are (inverse of [[own_left + link, -link], [.., own_right + link]])
-    times (J w + h R k v + half the shaft's torque impulse) for each of the two wheels.
+    The wheel speeds after the step are A⁻¹ p, with
+
+        A = [[own_left + link, -link], [-link, own_right + link]]
+        p = J w + h R (k v - push) + half the shaft's torque impulse
+
+    for each wheel. v is the hub's speed along the wheel; k and push are of `tyre.Contact`.
     """
 
     own_left: Scalar  # J + h (R² k + b), kg m²
     own_right: Scalar
-    link: Scalar  # h times the differential's coupling
-    inverse: Scalar  # of the determinant
-    share_left: Scalar  # speed of a wheel per torque impulse of the shaft
+    link: Scalar  # h · coupling of the differential
+    inverse: Scalar  # 1 / determinant of A
+    share_left: Scalar  # speed of the left wheel per torque impulse of the shaft
     share_right: Scalar
     resistance: Scalar  # torque impulse per mean speed of the axle
 
 
 class Shaft(NamedTuple):
-    """The coupling of the two axles: torque impulse = constant - matrix · free mean speeds."""
+    """The shaft's torque impulses on both axles: (front, rear) - matrix · free mean speeds.
+
+    An axle's free mean speed is the mean of its wheel speeds without the shaft's impulse.
+    """
 
     front: Scalar
     rear: Scalar
@@ -39,7 +46,7 @@ class Shaft(NamedTuple):
 
 
 def coupling(lock: Scalar) -> Scalar:
-    """Viscous coupling (N m s) of a differential: 0 open, nearly rigid at a lock of 1."""
+    """Viscous coupling (N m s) of a differential. It is 0 at lock 0 and nearly rigid at lock 1."""
     return COUPLING * lock / (1 - lock + 1e-6)
 
 
@@ -52,18 +59,18 @@ def driven_speed(car: Car, wheels: Wheels) -> Scalar:
 
 
 def rotor_inertia(car: Car) -> Scalar:
-    """Inertia of the rotor seen from the driven wheels (kg m²)."""
+    """Inertia of the rotor, referred to the driven wheels (kg m²)."""
     return car.drivetrain.gear_ratio**2 * car.motor.rotor_inertia
 
 
 def drag(car: Car, speed: Scalar) -> Scalar:
-    """Drag of one wheel as a torque per speed (N m s): dry drag fades out at standstill."""
+    """Drag torque of one wheel per speed (N m s). Dry drag fades out at standstill."""
     dry = car.drivetrain.drag * jax.lax.rsqrt(speed**2 + STANDSTILL**2)
     return (dry + car.drivetrain.drag_viscous) / 4
 
 
 def axle(lock: Scalar, own_left: Scalar, own_right: Scalar, h: Scalar) -> Axle:
-    """The axle whose wheels have these own inertias (J + h (R² k + b)) in a step of h."""
+    """The `Axle` of two wheels with own = J + h (R² k + b), in a step of h seconds."""
     link = h * coupling(lock)
     both = own_left + own_right
     determinant = own_left * own_right + link * both
@@ -80,11 +87,11 @@ def axle(lock: Scalar, own_left: Scalar, own_right: Scalar, h: Scalar) -> Axle:
 
 
 def shaft(car: Car, front: Axle, rear: Axle, drive: Drive, speed: Scalar, h: Scalar) -> Shaft:
-    """Motor, rotor and centre coupling between two axles.
+    """The `Shaft` of motor, rotor and centre coupling between two axles.
 
-    With a = diag(axle resistances) and C the shaft's own matrix, the torque impulses are
-    a (a + C)⁻¹ p c - a (a + C)⁻¹ C s for the axles' free mean speeds s. Expanded so that
-    nothing cancels when the centre is all but rigid.
+    The torque impulses are a (a + C)⁻¹ (p c - C s). a = diag(axle resistances), C is the shaft's
+    own matrix, p its free impulse, c the axles' torque shares and s their free mean speeds. The
+    expanded form has no cancellation when the centre coupling is nearly rigid.
     """
     to_front = car.drivetrain.front_share
     to_rear = 1 - to_front
@@ -108,7 +115,7 @@ def shaft(car: Car, front: Axle, rear: Axle, drive: Drive, speed: Scalar, h: Sca
 
 
 def shaft_impulses(s: Shaft, front: Axle, rear: Axle, momenta: Wheels) -> tuple[Scalar, Scalar]:
-    """Torque impulses on the front and rear axle for the wheels' free angular momenta."""
+    """Torque impulses on front and rear axle, from the wheels' free angular momenta (N m s)."""
     free_front = front.share_left * momenta.front_left + front.share_right * momenta.front_right
     free_rear = rear.share_left * momenta.rear_left + rear.share_right * momenta.rear_right
     return (
@@ -118,7 +125,7 @@ def shaft_impulses(s: Shaft, front: Axle, rear: Axle, momenta: Wheels) -> tuple[
 
 
 def wheel_speeds(a: Axle, left: Scalar, right: Scalar, impulse: Scalar) -> tuple[Scalar, Scalar]:
-    """Speeds of an axle's wheels from their free angular momenta and the shaft's impulse."""
+    """Speeds of an axle's wheels, from their free angular momenta and the shaft's impulse."""
     return (
         ((a.own_right + a.link) * left + a.link * right) * a.inverse + a.share_left * impulse,
         ((a.own_left + a.link) * right + a.link * left) * a.inverse + a.share_right * impulse,

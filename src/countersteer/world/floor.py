@@ -1,4 +1,4 @@
-"""The floor: friction that varies from place to place, as a sum of waves."""
+"""The floor: friction that varies with position, as a sum of waves."""
 
 import math
 from collections.abc import Mapping
@@ -13,9 +13,9 @@ from countersteer.errors import InputError
 from countersteer.signals import Motion, Scalar, Wheels
 from countersteer.world.angle import cosine, cosine_sine
 
-KEYS = ("x_radpm", "y_radpm", "phase_rad")  # of a wave in files
+KEYS = ("x_radpm", "y_radpm", "phase_rad")  # keys of a wave in files
 WAVES = 8
-LARGEST = 0.95 / math.sqrt(2 * WAVES)  # deviation up to which no place is without friction
+LARGEST = 0.95 / math.sqrt(2 * WAVES)  # deviation up to which friction is positive everywhere
 
 
 class Wave(NamedTuple):
@@ -27,21 +27,21 @@ class Wave(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Friction over that of the tyres at a place p: 1 + amplitude · Σ cos(wave · p + phase)."""
+    """Factor on the tyres' friction at a position p: 1 + amplitude · Σ cos(wave · p + phase)."""
 
     waves: tuple[Wave, ...]
     amplitude: Scalar
 
 
 def draw(key: jax.Array, deviation: Scalar = 0.1, length: Scalar = 0.5) -> Floor:
-    """A floor at random, whose friction deviates by so much (1) over so many metres.
+    """A random floor, from a standard deviation of friction (1) and a correlation length (m).
 
-    It is close to a Gaussian field: the mean is 1, the standard deviation as given, and over a
-    distance d the correlation is exp(-d²/2 length²), each over all draws. It never leaves
-    1 ± deviation sqrt(2 WAVES), which is above 0 for a deviation of at most `LARGEST`.
+    It is nearly a Gaussian field. Over all draws, its mean is 1, its standard deviation is
+    `deviation`, and its correlation over a distance d is exp(-d² / (2 length²)). Friction stays
+    within 1 ± deviation sqrt(2 WAVES). This is positive for a deviation of at most `LARGEST`.
 
     Source: A. Rahimi and B. Recht, Random features for large-scale kernel machines, NIPS 2007. The
-    directions of the waves are spread evenly, so that a single draw is alike along all of them.
+    waves' directions are spread evenly, so that a single draw is alike in all directions.
     """
     radius, direction, phase = jax.random.uniform(key, (3, WAVES), jnp.result_type(float))
     number = jnp.sqrt(-2 * jnp.log1p(-radius)) / length  # of a Gaussian vector in the plane
@@ -52,7 +52,7 @@ def draw(key: jax.Array, deviation: Scalar = 0.1, length: Scalar = 0.5) -> Floor
 
 
 def friction(floor: Floor, x: Scalar, y: Scalar) -> Scalar:
-    """Friction at a place (m), over that of the tyres."""
+    """Factor on the tyres' friction at a position x, y (m)."""
     total = sum(cosine(w.x * x + w.y * y + w.phase) for w in floor.waves)
     return 1 + floor.amplitude * total
 
@@ -60,7 +60,7 @@ def friction(floor: Floor, x: Scalar, y: Scalar) -> Scalar:
 def under_wheels(
     floor: Floor | None, body: Body, motion: Motion, time: Scalar = 0.0
 ) -> Wheels | None:
-    """`friction` at each contact so long (s) after an instant; None without a floor."""
+    """`friction` at each contact, `time` seconds after `motion`. None without a floor."""
     if floor is None:
         return None
     angle = motion.heading + time * motion.yaw_rate
@@ -84,7 +84,7 @@ def floor_tables(floor: Floor) -> dict[str, Any]:
 
 
 def floor_of_run(about: Mapping[str, Any]) -> Floor | None:
-    """The floor of a `run.toml`, if it was not the same everywhere. Raises `InputError`."""
+    """The floor in a `run.toml`; None if its friction is uniform. Raises `InputError`."""
     tables = about.get("floor")
     if tables is None:
         return None

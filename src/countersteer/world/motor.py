@@ -1,4 +1,4 @@
-"""Motor and speed controller: torque at the wheels as a line over their speed."""
+"""Motor and speed controller: torque at the wheels, linear in their speed."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,12 @@ from countersteer.car.car import Battery, Drivetrain, Motor
 from countersteer.signals import Scalar
 from countersteer.world import battery as pack
 
-NEUTRAL = 0.05  # duty over which the controller goes from its neutral brake to driving
-STANDSTILL = 10.0  # wheel speed (rad/s) over which braking hands over to reversing
+NEUTRAL = 0.05  # duty at which the neutral brake has fully given way to driving
+STANDSTILL = 10.0  # wheel speed (rad/s) below which braking fades into reversing
 
 
 class Drive(NamedTuple):
-    """Torque at the wheels, all four together: torque - slope · driven speed."""
+    """Total torque at the four wheels: torque - slope · driven speed."""
 
     torque: Scalar  # N m
     slope: Scalar  # N m s, >= 0
@@ -22,7 +22,7 @@ class Drive(NamedTuple):
 
 
 def duty(motor: Motor, throttle: Scalar) -> Scalar:
-    """Duty for a throttle: none in the dead zone, full from `full_throttle` on, odd."""
+    """Duty of a throttle: 0 in the dead zone, 1 from `full_throttle` on. An odd function."""
     span = motor.full_throttle - motor.dead_zone
     return jnp.sign(throttle) * jnp.clip((jnp.abs(throttle) - motor.dead_zone) / span, 0.0, 1.0)
 
@@ -30,16 +30,20 @@ def duty(motor: Motor, throttle: Scalar) -> Scalar:
 def drive(
     motor: Motor, drivetrain: Drivetrain, battery: Battery, d: Scalar, charge: Scalar, speed: Scalar
 ) -> Drive:
-    """The motor's torque at duty d and driven speed (rad/s, at the wheels).
+    """The motor's torque at duty d and driven speed w (rad/s, at the wheels).
 
-    The controller chops the battery. Where the current flows on through its pauses, that through
-    the windings is (d U - k n w) / (R + d² R_battery), and d times that is the battery's. Where it
-    dies at once, the back-EMF opposes it while switched on only: d (U - k n w) / (R + R_battery),
-    all of it the battery's; a car at part throttle then runs nearly as fast as at full throttle if
-    little resists. `conduction` goes from the second to the first. Outrunning the throttle,
-    only the part `overrun` of the then negative current flows. At neutral, and in braking (d < 0
-    while rolling forward), the windings are shorted by parts: torque proportional to speed.
-    The torque is linear in the speed, so that it can be taken at the end of a step.
+    The controller switches the battery voltage U on and off. `conduction` goes from case 0 to 1:
+
+    1: Current flows on through the pauses. The windings' current is
+       (d U - k n w) / (R + d² R_battery). The battery's current is d times that.
+    0: Current stops in the pauses. Back-EMF opposes it only while switched on. Both currents are
+       d (U - k n w) / (R + R_battery). So with little resistance to motion, a car at part
+       throttle runs nearly as fast as at full throttle.
+
+    k is the torque constant, n the gear ratio. If the car outruns its throttle, the current is
+    negative, and only the part `overrun` of it flows. At neutral, and in braking (d < 0 while
+    rolling forward), the windings are partly shorted: torque is proportional to speed. The torque
+    is linear in the speed, so that an implicit step can evaluate it at its end.
     """
     back_emf = motor.torque_constant * drivetrain.gear_ratio  # V per rad/s of the wheels
     shorted = back_emf**2 / motor.resistance
@@ -52,7 +56,7 @@ def drive(
     opposed = motor.conduction + pause * jnp.abs(applied)
     current = (applied * voltage - opposed * back_emf * speed) / path
     drives = current * applied >= 0
-    # No current is driven where nothing is applied: at neutral the brake alone acts.
+    # Without applied voltage no current is driven: at neutral only the brake acts.
     share = jnp.where(drives, 1.0, motor.overrun) * jnp.clip(jnp.abs(applied) / NEUTRAL, 0.0, 1.0)
     share = share * jnp.minimum(1.0, motor.current_limit / (jnp.abs(current) + 1e-9))
     strength = share * drivetrain.efficiency * back_emf / path

@@ -1,24 +1,27 @@
 """The planar world: one tick takes a car from one instant to the next.
 
-`step` runs the named `STAGES` in their order. The stage `move` is the physics proper. A contact's
-force is -k times its slip velocity, with k >= 0 from the tyre law; with G the matrix that maps all
-velocities v (body, wheels) to slips, M the inertias, and D >= 0 what drag and back-EMF resist with,
+`step` runs the `STAGES` in their order. The stage `move` is the physics. A contact's force is -k
+times its slip velocity; the tyre law gives k >= 0. The equation of motion is
 
-    M dv/dt = -(Gᵀ K G + D) v + a,        a the motor's torque.
+    M dv/dt = -(Gᵀ K G + D) v + a
 
-`move` predicts the middle of the tick with one implicit Euler step, takes all coefficients there,
-and holds them over the tick, in the body's axes at its middle. What is then linear is solved by
-two implicit Euler stages of gamma h, Alexander's L-stable method of second order, and the velocity
-is rotated exactly into those axes before and out of them after. So the scheme is of second order
-where the motion is smooth. Wheels, differentials, rotor and back-EMF are eliminated in closed
-form, and a 3 x 3 system is left for the body.
+v holds the velocities of body and wheels. G maps them to slip velocities. M holds the inertias, K
+the values of k, D >= 0 the resistance of drag and back-EMF, and a is the motor's torque.
 
-A contact whose slip keeps its direction is followed along the tangent of its law, any other along
-its chord, which is -k times the slip at the end of the stage. Chords alone take energy out at any
-step h and any k >= 0, as the held system is then symmetric and every mode of it is damped;
-tangents do not guarantee it. So a tick that would end with more kinetic energy than it began with
-and the motor (or a Magic Formula's shift) can have put in is taken in part, and the next one on
-chords, which always gets on: it gives up order, and contacts cannot put energy in.
+`move` predicts the middle of the tick with one implicit Euler step. It computes all coefficients
+there and holds them over the tick, in the body's axes at the middle. Two implicit Euler stages of
+gamma h solve the resulting linear system (Alexander's L-stable method of second order). The
+velocity is rotated exactly, into those axes before and out of them after. So the scheme is of
+second order where the motion is smooth. Wheels, differentials, rotor and back-EMF are eliminated
+in closed form. A 3 x 3 system is left for the body.
+
+If a contact's slip keeps its direction (`steady`), its force follows the tangent of the tyre law.
+Otherwise it follows the chord: -k times the slip at the end of the stage. Chords alone remove
+energy at any step h and any k >= 0: the held system is symmetric, and all its modes are damped.
+Tangents do not guarantee this. So `guarded` compares the kinetic energy at the end of a tick with
+that at its start plus the supply of the motor (or of a Magic Formula's shift). If it is larger,
+only a part of the tick's change is applied, and the next tick uses chords, which always make
+progress. This costs order, but contacts cannot add energy.
 
 Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 """
@@ -42,15 +45,15 @@ from countersteer.world.floor import Floor, under_wheels
 from countersteer.world.state import State
 from countersteer.world.world import Events
 
-ROLL_OVER_TIME = 0.1  # s that a pair of wheels is in the air until the car counts as rolled over
-FEW = 32  # slots of a delay line that are read one by one
+ROLL_OVER_TIME = 0.1  # s with a pair of wheels in the air; then the car counts as rolled over
+FEW = 32  # slots; a delay line of up to so many is read without an index
 TANGENT = Wheels(1.0, 1.0, 1.0, 1.0)
 GAMMA = 1 - math.sqrt(0.5)  # of the two-stage method
 TOUCH_TIME = 0.2  # s without contact after which the next one is a new touch
 
 
 class Tick(NamedTuple):
-    """What a stage of a tick works with, besides the state."""
+    """The input of a stage of a tick, besides the state."""
 
     car: Car
     walls: jax.Array  # (n, 4): x, y of both ends, m; rows of NaN are padding
@@ -58,7 +61,7 @@ class Tick(NamedTuple):
     asked: Command  # as it reaches motor and servo, after their delays
     count: Scalar  # ticks since the start, an integer
     dt: float
-    floor: Floor | None = None  # None: the same friction everywhere
+    floor: Floor | None = None  # None: uniform friction
 
 
 def initial_state(
@@ -69,9 +72,9 @@ def initial_state(
     charge: float = 1.0,
     slots: int | None = None,
 ) -> State:
-    """A car at x, y, heading with velocity vx, vy, yaw rate; wheels roll, no command is under way.
+    """A car at x, y, heading with velocity vx, vy, yaw rate. Its wheels roll.
 
-    `slots` is the length of the delay lines in ticks; by default what the car's delays need.
+    The delay lines hold zeros. `slots` is their length in ticks, by default `delay_slots`.
     """
     dtype = jnp.result_type(car.body.mass)
     zero = dtype.type(0)
@@ -93,7 +96,7 @@ def initial_state(
 
 
 def delay_slots(car: Car, dt: float) -> int:
-    """Ticks that a delay line must hold; a power of two, so that like cars share a program."""
+    """Length of the delay lines in ticks: a power of two, so that similar cars share a program."""
     longest = max(float(np.max(car.motor.delay)), float(np.max(car.servo.delay)))
     return 1 << math.ceil(math.log2(longest / dt + 3))
 
@@ -105,7 +108,7 @@ def tires_by_wheel(car: Car) -> Wheels:
 
 
 def tires_on(car: Car, friction: Wheels | None) -> Wheels:
-    """The tyre on each wheel, with its friction on the floor under it."""
+    """The tyre on each wheel, with its friction scaled by the floor under it."""
     tires = tires_by_wheel(car)
     return tires if friction is None else Wheels(*map(tyre.scaled, tires, friction))
 
@@ -121,8 +124,8 @@ def step(
 ) -> State:
     """One tick of dt seconds. Pure; works under `jit`, `vmap` (the count unbatched) and `grad`.
 
-    Throttle in [-1, 1], steering in rad. Precision is that of the car's leaves. Without a `floor`
-    friction is the same everywhere, and nothing is computed for it.
+    Throttle is in [-1, 1], steering in rad. Precision is that of the car's leaves. Without a
+    `floor`, friction is uniform and costs no computation.
     """
     tick = Tick(car, around, command, command, count, dt, floor)
     for stage in STAGES:
@@ -131,7 +134,7 @@ def step(
 
 
 def delay(state: State, tick: Tick) -> tuple[State, Tick]:
-    """Pure delays of throttle and steering, to fractions of a tick by interpolation."""
+    """Apply the pure delays of throttle and steering, with interpolation between ticks."""
     throttle_line, throttle = _delayed(
         state.throttle_line, tick.command.throttle, tick.car.motor.delay, tick
     )
@@ -145,7 +148,7 @@ def delay(state: State, tick: Tick) -> tuple[State, Tick]:
 def _delayed(line: Array, now: Scalar, time: Scalar, tick: Tick) -> tuple[Array, Scalar]:
     slots = line.shape[0]
     slot = jnp.arange(slots)
-    # A choice by slot stays in place in a batch; an update by index would transpose it.
+    # In a batch, a choice by slot stays in place; an update by index would transpose the line.
     line = jnp.where(slot == tick.count % slots, jnp.asarray(now, line.dtype), line)
     ticks = jnp.clip(time / tick.dt, 0.0, slots - 2)
     whole = jnp.floor(ticks)
@@ -153,14 +156,14 @@ def _delayed(line: Array, now: Scalar, time: Scalar, tick: Tick) -> tuple[Array,
     part = ticks - whole
     if slots > FEW:
         return line, (1 - part) * line[newest % slots] + part * line[(newest - 1) % slots]
-    # A batch's look-ups are slow.
+    # Indexing is slow in a batch.
     share = jnp.where(slot == newest % slots, 1 - part, 0.0)
     share = jnp.where(slot == (newest - 1) % slots, part, share)
     return line, sum(share[i] * line[i] for i in range(slots))
 
 
 def move(state: State, tick: Tick) -> tuple[State, Tick]:
-    """The motion over the tick: coefficients from its middle, then two stages of the solver."""
+    """The motion over the tick: coefficients at its middle, then two implicit stages."""
     car, h, start = tick.car, tick.dt, state.motion
     goal = Command(
         motor.duty(car.motor, tick.asked.throttle),
@@ -208,10 +211,11 @@ def guarded(
     after: tuple[Vector, Wheels],
     h: Scalar,
 ) -> tuple[tuple[Vector, Wheels], Scalar]:
-    """The velocities after a tick, short of gaining energy, and 1 if they would have, else 0.
+    """The velocities after a tick without a gain of energy, and 1 if they were limited, else 0.
 
-    With the change d, the energy after the part p of it is E + p g + p² K(d). Beyond
-    p = (h P - g) / K(d) it exceeds what the power P can have put in; half of that is taken.
+    After a part p of the change d, the energy is E + p g + p² K(d). P is the supplied power. If
+    the whole change gains more than h P, half of p = (h P - g) / K(d) is applied. At that p, the
+    gain equals the supply p h P.
     """
     power = pushed_power(held) + jnp.maximum(
         *(motor_power(car, held.drive, wheels) for _, wheels in (before, after))
@@ -230,7 +234,7 @@ def guarded(
 def two_stages(
     car: Car, held: "Grip", tangent_weight: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
 ) -> tuple[Vector, Wheels]:
-    """Velocities h seconds later, by Alexander's two implicit stages with the grip held."""
+    """Velocities after h seconds, by Alexander's two implicit stages with constant `Grip`."""
     first, first_wheels = implicit(car, held, tangent_weight, velocity, wheels, GAMMA * h)
     lifted, lifted_wheels = jax.tree.map(
         lambda v, w: v + (1 - GAMMA) / GAMMA * (w - v), (velocity, wheels), (first, first_wheels)
@@ -239,9 +243,9 @@ def two_stages(
 
 
 def steady(start: "Grip", middle: "Grip") -> Wheels:
-    """1 for each contact whose slip keeps its direction from the tick's start to its middle.
+    """1 for each contact whose slip turns by less than 90° in the first half of the tick, else 0.
 
-    Its force is then followed along its tangent: a sliding contact's is all but constant.
+    Such a contact follows its tangent: the force of a sliding contact is nearly constant.
     """
     return Wheels(
         *(
@@ -252,18 +256,18 @@ def steady(start: "Grip", middle: "Grip") -> Wheels:
 
 
 def motor_power(car: Car, drive: motor.Drive, wheels: Wheels) -> Scalar:
-    """Power that the motor puts in at these wheel speeds, never negative (W)."""
+    """Power that the motor supplies at these wheel speeds (W), at least 0."""
     driven = drivetrain.driven_speed(car, wheels)
     return jnp.maximum((drive.torque - drive.slope * driven) * driven, 0.0)
 
 
 def pushed_power(held: "Grip") -> Scalar:
-    """Power that the shifts of Magic Formula tyres put in, never negative (W)."""
+    """Power that the shifts of Magic Formula tyres supply (W), at least 0."""
     return sum(jnp.maximum(c.force_x * c.slip_x + c.force_y * c.slip_y, 0.0) for c in held.contacts)
 
 
 def follow(car: Car, motion: Motion, goal: Command, h: Scalar) -> Motion:
-    """Servo and speed controller after h seconds on their way to `goal`."""
+    """The motion with steering and duty h seconds later, as they approach `goal`."""
     return motion._replace(
         steering=servo.turn(car.servo, motion.steering, goal.steering, h),
         duty=motion.duty - (goal.throttle - motion.duty) * jnp.expm1(-h / car.motor.lag),
@@ -271,7 +275,7 @@ def follow(car: Car, motion: Motion, goal: Command, h: Scalar) -> Motion:
 
 
 def loaded(car: Car, motion: Motion, start: Motion, change: Vector, h: Scalar) -> Motion:
-    """The loads' accelerations after h seconds in which the velocity changed by this much."""
+    """The motion with `load_ax` and `load_ay` after h seconds with this change of velocity."""
     follows = -jnp.expm1(-h / car.body.load_lag)
     return motion._replace(
         load_ax=start.load_ax + follows * (change.x / h - start.load_ax),
@@ -280,9 +284,9 @@ def loaded(car: Car, motion: Motion, start: Motion, change: Vector, h: Scalar) -
 
 
 def rotated(v: Vector, angle: Scalar) -> Vector:
-    """The velocity v in axes turned by a small angle; its length is kept exactly.
+    """The velocity v in axes that are turned by a small angle (rad). Its length is kept exactly.
 
-    The rotation is by 2 atan(a), which is `angle` to the fifth order.
+    The rotation is by 2 atan(a), which differs from `angle` by terms of fifth order.
     """
     a = angle / 2 * (1 + angle**2 / 12)
     c, s = (1 - a**2) / (1 + a**2), 2 * a / (1 + a**2)
@@ -297,7 +301,7 @@ class Steered(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """What acts on the car at an instant, as coefficients of its velocities."""
+    """The forces on the car at an instant, as coefficients of its velocities."""
 
     steered: Steered
     contacts: Wheels  # a tyre.Contact each
@@ -307,7 +311,7 @@ class Grip(NamedTuple):
 
 @jax.jit
 def grip(car: Car, motion: Motion, friction: Wheels | None = None) -> Grip:
-    """Contacts, drag and drive at an instant; `friction` is that of the floor over the tyres'."""
+    """Contacts, drag and drive at an instant. `friction` is the floor's factor at each contact."""
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
     steered = Steered(*servo.directions(car.body, car.servo, motion.steering))
     rolls, slides = contact_directions(car, steered)
@@ -331,7 +335,7 @@ def grip(car: Car, motion: Motion, friction: Wheels | None = None) -> Grip:
 def implicit(
     car: Car, held: "Grip", tangent_weight: Wheels, velocity: Vector, wheels: Wheels, h: Scalar
 ) -> tuple[Vector, Wheels]:
-    """Velocities h seconds later, by one implicit Euler step with the grip held as it is.
+    """Velocities after h seconds, by one implicit Euler step with constant `Grip`.
 
     Solves (M + h C) v' = M v + h a, where a - C v are the forces of contacts, drag and drive.
     A contact's force follows its chord where `tangent_weight` is 0, its tangent where it is 1.
@@ -344,12 +348,12 @@ def implicit(
         across.append(c.k_y + w * (c.tangent_y - c.k_y))
         push_x.append(c.push_x + w * (c.tangent_x - c.k_x) * c.slip_x)
         push_y.append(c.push_y + w * (c.tangent_y - c.k_y) * c.slip_y)
-    # Torque impulse per slip speed; inertia of each wheel with what resists it in the step.
+    # Torque impulse per slip speed, J + h b, and J + h (R² k + b) of each wheel.
     pull = [h * tire.radius * k for tire, k in zip(tires, along, strict=True)]
     bare = [tire.inertia + h * b for tire, b in zip(tires, held.drag, strict=True)]
     own = [b + p * tire.radius for b, p, tire in zip(bare, pull, tires, strict=True)]
 
-    # Wheels, differentials and rotor as a linear function of the hubs' speeds to come.
+    # Wheels, differentials and rotor, linear in the hubs' speeds at the end of the step.
     lock = car.drivetrain
     front = drivetrain.axle(lock.front_lock, own[0], own[1], h)
     rear = drivetrain.axle(lock.rear_lock, own[2], own[3], h)
@@ -362,9 +366,9 @@ def implicit(
             for tire, speed, push in zip(tires, wheels, push_x, strict=True)
         )
     )
-    standing = _speeds(front, rear, coupled, free)  # if the hubs stood still
+    standing = _speeds(front, rear, coupled, free)  # wheel speeds with hubs at rest
 
-    # The body: (inertia + what the contacts resist with) velocity' = momentum + what wheels push.
+    # The body: (inertia + contacts' resistance) velocity' = momentum + impulse of the wheels.
     matrix = Symmetric(body.mass, body.mass, body.yaw_inertia, 0.0, 0.0, 0.0)
     momentum = Vector(
         body.mass * velocity.x, body.mass * velocity.y, body.yaw_inertia * velocity.yaw
@@ -377,7 +381,7 @@ def implicit(
     pulls = []
     for axle, left, right in ((front, 0, 1), (rear, 2, 3)):
         for this, other_own in ((left, axle.own_right), (right, axle.own_left)):
-            # h k - pull² (inverse of the axle's matrix), written so that nothing cancels
+            # h k - pull² A⁻¹ (A: `drivetrain.Axle`), in a form without cancellation
             resists = bare[this] * (other_own + axle.link) + axle.link * other_own
             matrix = matrix.plus(h * along[this] * resists * axle.inverse, rolls[this])
         mixed = -pull[left] * pull[right] * axle.link * axle.inverse
@@ -408,7 +412,7 @@ def _speeds(
 
 
 def contact_directions(car: Car, steered: Steered) -> tuple[Wheels, Wheels]:
-    """How the body's velocities move each contact: along its wheel, and to the wheel's left."""
+    """Rows that map the body's velocities to each hub's: along its wheel, and to its left."""
     xs, ys = wheel_positions(car.body)
     ahead = (1.0, 0.0)
     rolls, slides = [], []
@@ -419,7 +423,7 @@ def contact_directions(car: Car, steered: Steered) -> tuple[Wheels, Wheels]:
 
 
 def kinetic_energy(car: Car, velocity: Vector, wheels: Wheels) -> Scalar:
-    """Of the body, the wheels' spin and the rotor's (J)."""
+    """Kinetic energy of the body, the wheels' spin and the rotor (J)."""
     energy = (
         car.body.mass * (velocity.x**2 + velocity.y**2) + car.body.yaw_inertia * velocity.yaw**2
     )
@@ -430,7 +434,7 @@ def kinetic_energy(car: Car, velocity: Vector, wheels: Wheels) -> Scalar:
 
 
 def collide(state: State, tick: Tick) -> tuple[State, Tick]:
-    """Walls: the deepest contact of the tick is pushed out and takes its impulse."""
+    """Move the car out of its deepest contact with a wall, apply the impulse, count new touches."""
     motion, touches = walls.collide(tick.car.body, tick.walls, state.motion)
     fresh = touches * jnp.where(state.touching <= 0, 1.0, 0.0)
     touching = jnp.where(touches > 0, TOUCH_TIME, jnp.maximum(state.touching - tick.dt, 0.0))
@@ -441,7 +445,7 @@ def collide(state: State, tick: Tick) -> tuple[State, Tick]:
 
 
 def judge(state: State, tick: Tick) -> tuple[State, Tick]:
-    """Notes a car that has two wheels in the air for too long."""
+    """Mark a car as rolled over after `ROLL_OVER_TIME` with a pair of wheels in the air."""
     loads = chassis.wheel_loads(tick.car.body, state.motion.load_ax, state.motion.load_ay)
     up = chassis.pair_in_air(loads)
     airborne = up * (state.airborne + tick.dt)
@@ -453,11 +457,11 @@ STAGES: tuple[Callable[[State, Tick], tuple[State, Tick]], ...] = (delay, move, 
 
 
 class Forces(NamedTuple):
-    """A wheel's contact for pictures and tests: force in the wheel's own axes."""
+    """Force of one contact in the axes of its wheel, for pictures and tests."""
 
     force_x: Scalar  # N
     force_y: Scalar
-    limit: Scalar  # what the contact can hold at this load, N
+    limit: Scalar  # upper limit of the force at this load, N (`tyre.limit`)
     slip: Scalar  # speed of the contact over the ground, m/s
     angle: Scalar  # of the wheel, rad
 
@@ -500,7 +504,7 @@ class Planar:
         velocity: tuple[Scalar, Scalar, Scalar] = (0.0, 0.0, 0.0),
         charge: Scalar = 1.0,
     ) -> State:
-        """The car at x, y, heading with velocity vx, vy, yaw rate; no command is under way."""
+        """The car at x, y, heading with velocity vx, vy, yaw rate. See `initial_state`."""
         return initial_state(self.car, self.dt, pose, velocity, charge, self.slots)
 
     def step(self, state: State, command: Command, tick: Scalar) -> State:
@@ -508,11 +512,11 @@ class Planar:
         return step(self.car, self.walls, state, command, tick, self.dt, self.floor)
 
     def motion(self, state: State) -> Motion:
-        """The car's."""
+        """The car's motion."""
         return state.motion
 
     def events(self, state: State) -> Events:
-        """Touches of walls, and whether the car lies on its side."""
+        """Touches of walls so far, and 1 if the car has rolled over."""
         return Events(state.wall_contacts, state.rolled_over)
 
     def forces(self, motion: Motion) -> Wheels:
@@ -521,5 +525,5 @@ class Planar:
 
 
 def planar(car: Car, walls: Array, floor: Floor | None, dt: float) -> Planar:
-    """The world of a car; its precision is that of the car's leaves."""
+    """The planar world of a car. Its precision is that of the car's leaves."""
     return Planar(car=car, walls=walls, floor=floor, dt=dt, slots=delay_slots(car, dt))

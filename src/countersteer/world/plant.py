@@ -1,7 +1,7 @@
-"""The plant: one open-loop rollout over the planar world, which fits and planners share.
+"""The plant: one open-loop rollout of the planar world, for fits and planners.
 
-Commands in, motion out. There are no sensors, no link and no delay lines: a delay is undone before,
-by taking the commands later (`delayed`), so that it has a derivative like all else.
+Commands in, motion out. There are no sensors, no link and no delay lines. Instead, `delayed`
+shifts the commands before the rollout. So the delays have derivatives too.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Seen = TypeVar("Seen")
 
 
 def delayed(line: Array, ticks: Scalar) -> Array:
-    """The line so many ticks later, by interpolation; it was what it is at its start before."""
+    """The line delayed by `ticks`, by interpolation. Before its start, its first value holds."""
     at = jnp.arange(line.shape[0]) - ticks
     whole = jnp.floor(at)
     part = at - whole
@@ -39,9 +39,9 @@ def as_it_arrives(car: Car, asked: Command, dt: float) -> Command:
 
 
 def settled(car: Car, commands: Command, dt: float) -> tuple[Scalar, Scalar]:
-    """Where servo (rad) and speed controller (duty) stand after commands (ticks,).
+    """Steering angle (rad) and duty after commands (ticks,).
 
-    They begin where the first command would have them.
+    They begin at the steady state of the first command.
     """
     goals = Command(
         motor.duty(car.motor, commands.throttle), servo.target(car.servo, commands.steering)
@@ -75,10 +75,10 @@ def rollout(
     walls: Array | None = None,
     floor: Floor | None = None,
 ) -> tuple[State, Seen]:
-    """The state after commands (ticks,), and what `look` sees of it after each `every` ticks.
+    """The state after commands (ticks,), and the results of `look` after each `every` ticks.
 
-    Commands are taken as they reach motor and servo. The ticks are a multiple of `every`. Without
-    `walls` (n, 4) it is open floor, and nothing is computed for them.
+    Commands are as they reach motor and servo. The number of ticks is a multiple of `every`.
+    Without `walls` (n, 4) the floor is open: contacts and roll-over are not computed.
     """
     nowhere = jnp.full((1, 4), jnp.nan)
     stages = (planar.move,) if walls is None else (planar.move, planar.collide, planar.judge)

@@ -1,4 +1,4 @@
-"""Steering: from the angle asked for to where each front wheel points."""
+"""Steering: from the commanded angle to the direction of each front wheel."""
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +9,9 @@ from countersteer.world.angle import cosine_sine
 
 
 def target(servo: Servo, asked: Scalar) -> Scalar:
-    """The angle that the linkage settles at: gain and limit by side, then the trim (rad).
+    """Steady-state steering angle (rad) of a command: gain and limit of its side, then the trim.
 
-    softness blends clip(gain a, limit) into limit · tanh(gain a / limit).
+    `softness` blends clip(gain a, limit) into limit · tanh(gain a / limit).
     """
     left = asked >= 0
     gained = jnp.where(left, servo.gain_left, servo.gain_right) * asked
@@ -25,7 +25,7 @@ def target(servo: Servo, asked: Scalar) -> Scalar:
 
 
 def turn(servo: Servo, steering: Scalar, goal: Scalar, h: Scalar) -> Scalar:
-    """The angle after h seconds on the way to `goal`: first-order lag, limited rate (rad)."""
+    """Steering angle (rad) after h seconds towards `goal`: first-order lag, limited rate."""
     step = (goal - steering) * -jnp.expm1(-h / servo.lag)
     return steering + jnp.clip(step, -servo.rate * h, servo.rate * h)
 
@@ -35,8 +35,8 @@ def directions(
 ) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
     """(cosine, sine) of the angle of the left and of the right front wheel.
 
-    Ackermann's condition is cot(right) - cot(left) = track / wheelbase; a share of it is
-    tan(side) = t / (1 -+ share t track / (2 wheelbase)) with t = tan(steering).
+    Ackermann's condition is cot(right) - cot(left) = track / wheelbase. A share of it is
+    tan(side) = t / (1 -+ share t track / (2 wheelbase)), with t = tan(steering) and - for left.
     """
     cosine, sine = cosine_sine(steering)
     tangent = sine / cosine

@@ -1,4 +1,4 @@
-"""What the planar world knows about a car at one instant."""
+"""The state of the planar world at one instant."""
 
 from typing import NamedTuple
 
@@ -9,10 +9,10 @@ class State(NamedTuple):
     """A car in its world between two ticks."""
 
     motion: Motion
-    throttle_line: Array  # commands on their way, one slot a tick
+    throttle_line: Array  # commands within the pure delays, one slot a tick
     steering_line: Array
-    airborne: Scalar  # time that a pair of wheels has carried nothing, s
-    touching: Scalar  # time left in which a touch of a wall counts as the same one, s
+    airborne: Scalar  # time for which a pair of wheels has had no load, s
+    touching: Scalar  # remaining time in which a contact counts as the same touch, s
     wall_contacts: Scalar  # separate touches so far
-    energy_limited: Scalar  # 1 where the last tick was cut short of gaining energy
+    energy_limited: Scalar  # 1 if `planar.guarded` limited the last tick
     rolled_over: Scalar  # 1 from the moment the car counts as rolled over

@@ -1,4 +1,4 @@
-"""Tyres: the force of a contact at its slip, with the stiffness that an implicit step follows."""
+"""Tyres: force of a contact at its slip, and its stiffness for an implicit step."""
 
 import dataclasses
 from typing import NamedTuple
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from countersteer.car.car import MagicFormula, Tire
 from countersteer.signals import Scalar
 
-TINY = 1e-9  # keeps roots and their derivatives finite at no slip
+TINY = 1e-9  # keeps roots and their derivatives finite at zero slip
 
 
 class Contact(NamedTuple):
@@ -22,49 +22,49 @@ class Contact(NamedTuple):
     slip_y: Scalar
     k_x: Scalar  # >= 0
     k_y: Scalar
-    push_x: Scalar  # N; none with a brush tyre
+    push_x: Scalar  # N; 0 for a brush tyre
     push_y: Scalar
-    tangent_x: Scalar  # change of -force over change of slip velocity, >= 0
+    tangent_x: Scalar  # -d force / d slip velocity, >= 0
     tangent_y: Scalar
 
     @property
     def force_x(self) -> Scalar:
-        """Along the wheel, forward (N)."""
+        """Force along the wheel, forward (N)."""
         return self.push_x - self.k_x * self.slip_x
 
     @property
     def force_y(self) -> Scalar:
-        """To the wheel's left (N)."""
+        """Force to the wheel's left (N)."""
         return self.push_y - self.k_y * self.slip_y
 
 
 def contact(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar) -> Contact:
-    """A contact by the tyre's law. Load in N.
+    """A contact by the tyre's law, at a load (N).
 
-    The slip velocities are those of the contact over the ground along the wheel and to its left
-    (m/s), rim_speed is R w.
+    slip_x and slip_y (m/s) are the contact's velocity over the ground, along the wheel and to its
+    left. rim_speed (m/s) is R w.
     """
     law = magic_formula if tire.law == "magic-formula" else brush
     return law(tire, load, slip_x, slip_y, rim_speed)
 
 
 def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar) -> Contact:
-    """The brush model with a parabolic pressure, two frictions, and an ellipse of friction.
+    """The brush model with parabolic pressure, two friction coefficients and a friction ellipse.
 
-    Adhering tread has mu, sliding tread rho mu. With slip velocity s, tread speed
+    Adhering tread has friction mu, sliding tread rho mu. With slip velocity s, tread speed
     V = sqrt((R w)² + creep²), stiffness c per unit of load F, and the linear force z = |c s / V|:
 
-        q = min(z / (3 mu), 1)                       the part of the contact that slides
+        q = min(z / (3 mu), 1)                       the sliding part of the contact
         k_i = F [ c_i (1 - q)² / V + rho mu q² (3 - 2 q) / |s| ]
 
     For rho = 1 and one stiffness this is Fiala's cubic, z - z²/3mu + z³/27mu². The adhering part
-    pulls against the tread's deflection, the sliding part against the slip velocity itself, so
-    full sliding opposes the motion whatever the two stiffnesses are. Both k are >= 0: a contact
-    takes energy out. The largest force across the wheel is F mu (4 - 3 rho) / (3 - 2 rho)².
+    pulls against the tread's deflection, the sliding part against the slip velocity. So full
+    sliding opposes the motion, whatever the two stiffnesses are. Both k are >= 0: a contact
+    removes energy. The largest force across the wheel is F mu (4 - 3 rho) / (3 - 2 rho)².
 
-    Where friction along the wheel is e mu, the forces lie in an ellipse, and of those on it a
-    sliding contact's takes out the most energy. That is the same law for the slip (e s_x, s_y) and
-    the force (F_x / e, F_y), as both have the same power.
+    If friction along the wheel is e mu, the forces lie in an ellipse. A sliding contact has the
+    force on the ellipse that removes most energy. This equals the law above for the slip
+    (e s_x, s_y) and the force (F_x / e, F_y), since both pairs have the same power.
 
     Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 3 (brush model); E. Fiala, VDI-Z 96,
     1954; S. Goyal, A. Ruina, J. Papadopoulos, Wear 143, 1991 (limit surface, largest dissipation).
@@ -77,10 +77,10 @@ def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: S
     linear = jnp.sqrt((linear_x * slip_x) ** 2 + (linear_y * slip_y) ** 2 + TINY**2)
     slides = jnp.minimum(linear * (1 / (3 * tire.friction)), 1.0)
     adheres = (1 - slides) ** 2
-    slip = jax.lax.rsqrt(slip_x**2 + slip_y**2 + TINY**2)  # its inverse
+    slip = jax.lax.rsqrt(slip_x**2 + slip_y**2 + TINY**2)  # 1 / slip velocity
     sliding = tire.sliding_ratio * tire.friction * slides**2 * (3 - 2 * slides) * slip
     k_x, k_y = load * (linear_x * adheres + sliding), load * (linear_y * adheres + sliding)
-    # Along the slip the slope is dF/dz, and never less than none; across it, it is k itself.
+    # Along the slip, the slope is dF/dz, at least 0. Across the slip, it is k.
     slope = load * (1 - slides) * jnp.maximum(1 - (3 - 2 * tire.sliding_ratio) * slides, 0.0)
     part_x = (slip_x**2 + TINY**2 / 2) * slip**2
     tangent_x = part_x * slope * linear_x + (1 - part_x) * k_x
@@ -92,11 +92,11 @@ def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: S
 def magic_formula(
     tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar
 ) -> Contact:
-    """The Magic Formula in combined slip, followed along its tangents where these resist.
+    """The Magic Formula in combined slip. k is the slope of its tangent, at least 0.
 
-    With the hub's speed u = slip_x + R w, slip s = slip_x / max(|u|, creep) and slip angle
-    a = atan(slip_y / max(|u|, creep)). Its shifts push even at no slip; they fade out below the
-    speed `creep`, so that a car at rest stays at rest.
+    With the hub's speed u = slip_x + R w, the slip is slip_x / max(|u|, creep) and the slip angle
+    atan(slip_y / max(|u|, creep)). The formula's shifts push even at zero slip. They fade out
+    below the speed `creep`, so that a car at rest stays at rest.
     """
     hub = jnp.abs(slip_x + rim_speed)
     speed = jnp.maximum(hub, tire.creep_speed)
@@ -123,14 +123,14 @@ def magic_forces(
 ) -> tuple[Scalar, Scalar]:
     """Forces along the wheel and to its left (N) at a slip and a slip angle (rad).
 
-    slip is 1 - R w / u: positive while braking. Without camber, and with the sign of the sine's
-    shift as CommonRoad's code has it: inside the sine. For b slip or angle,
+    slip is 1 - R w / u: positive while braking. There is no camber. The shift of the sine is
+    inside the sine, as in CommonRoad's code. For b, -slip along and the angle across,
 
         pure   D sin(C atan(B b - E (B b - atan B b)))     D = d load, B = k load / (C D)
         loss   G(b) = cos(C atan(B b - E (B b - atan B b)))
 
-    the force along is that of pure slip times G(angle + shift) / G(shift), that across the same
-    with G of slip, and a shift S by slip. `shifts` scales all shifts.
+    The force along is its pure force times G(angle + shift) / G(shift). The force across is its
+    pure force times G(slip + shift) / G(shift), plus a shift by slip. `shifts` scales all shifts.
 
     Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 4; CommonRoad vehicle models 3.0.2.
     """
@@ -159,7 +159,7 @@ def magic_forces(
 
 
 def scaled(tire: Tire, friction: Scalar) -> Tire:
-    """The tyre on a floor of so many times the friction; its stiffnesses stay what they are."""
+    """The tyre with its friction times a factor. Its stiffnesses do not change."""
     if tire.law == "magic-formula":
         m = tire.magic_formula
         peaks = {"p_dx1": friction * m.p_dx1, "p_dy1": friction * m.p_dy1}
@@ -168,7 +168,7 @@ def scaled(tire: Tire, friction: Scalar) -> Tire:
 
 
 def limit(tire: Tire, load: Scalar) -> Scalar:
-    """The force that a contact can hold (N): a brush's adhering tread, or the formula's peak."""
+    """Upper limit of a contact's force (N): a brush's adhering tread, or the formula's peak."""
     if tire.law == "magic-formula":
         return jnp.maximum(tire.magic_formula.p_dx1, tire.magic_formula.p_dy1) * load
     return tire.friction * jnp.maximum(tire.longitudinal_ratio, 1.0) * load

@@ -1,4 +1,4 @@
-"""Walls: the car's rectangle against line segments."""
+"""Walls: contact of the car's rectangle with line segments."""
 
 import math
 from collections.abc import Callable
@@ -12,14 +12,14 @@ from countersteer.car.car import Body
 from countersteer.signals import Motion, Scalar
 from countersteer.world.angle import cosine_sine
 
-FAR = 1e5  # m
-LEAST = 8  # rows
-FEW = 16  # walls that are compared one by one
-PREFERENCE = 1e-3  # depth that a wall gives up per distance by which it misses the corner
+FAR = 1e5  # m, position of padding
+LEAST = 8  # rows of the shortest array
+FEW = 16  # walls; up to so many are compared one by one
+PREFERENCE = 1e-3  # reduction of a wall's depth, per distance by which it misses the corner
 
 
 def padded(walls: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """Walls with rows of NaN up to a power of two, so that like courses share a program."""
+    """Walls (n, 4), padded with NaN to a power of two of rows: similar courses share a program."""
     rows = max(LEAST, 1 << math.ceil(math.log2(max(len(walls), 1))))
     full = np.full((rows, 4), np.nan, dtype)
     full[: len(walls)] = walls
@@ -27,7 +27,7 @@ def padded(walls: np.ndarray, dtype: np.dtype) -> np.ndarray:
 
 
 class Overlap(NamedTuple):
-    """How the car's rectangle and a wall overlap, in axes at the rectangle's centre (m)."""
+    """Overlap of the car's rectangle and a wall (m), in axes at the rectangle's centre."""
 
     on_wall: Scalar  # along the wall's normal
     ahead: Scalar  # along the car, from its front
@@ -36,23 +36,23 @@ class Overlap(NamedTuple):
     to_right: Scalar
     normal_x: Scalar  # of the wall, towards the car
     normal_y: Scalar
-    point_x: Scalar  # on the wall: its deepest corner's foot
+    point_x: Scalar  # on the wall: foot of the rectangle's deepest corner
     point_y: Scalar
-    missed: Scalar  # by how much the wall ends short of that corner
+    missed: Scalar  # distance from the wall's end to that foot, if it lies beyond
 
     @property
     def on_x(self) -> Scalar:
-        """Along the car, from the nearer end."""
+        """Overlap along the car, from the nearer end."""
         return jnp.minimum(self.ahead, self.behind)
 
     @property
     def on_y(self) -> Scalar:
-        """Across the car, from the nearer side."""
+        """Overlap across the car, from the nearer side."""
         return jnp.minimum(self.to_left, self.to_right)
 
     @property
     def depth(self) -> Scalar:
-        """The least overlap on all axes; negative where one separates the two."""
+        """The smallest overlap of all axes. It is negative if an axis separates the two."""
         return jnp.minimum(jnp.minimum(self.on_x, self.on_y), self.on_wall)
 
 
@@ -72,7 +72,7 @@ class Wall(NamedTuple):
 
 
 def overlap(body: Body, wall: Wall) -> Overlap:
-    """The rectangle about the origin against a wall."""
+    """The overlap of the rectangle about the origin with a wall."""
     half_x, half_y = body.length / 2, body.width / 2
     ax, ay, tx, ty, length = wall
     bx, by = wall.end
@@ -80,7 +80,7 @@ def overlap(body: Body, wall: Wall) -> Overlap:
     side = jnp.where(nx * ax + ny * ay > 0, -1.0, 1.0)  # towards the rectangle's centre
     nx, ny = side * nx, side * ny
     reach = jnp.abs(nx) * half_x + jnp.abs(ny) * half_y
-    # Along the wall: the deepest corner, or the middle of a side that lies flat, on the wall.
+    # Position along the wall: of the deepest corner, or of the middle of a side that lies flat.
     corner_x, corner_y = -_sign(nx) * half_x, -_sign(ny) * half_y
     middle = (corner_x - ax) * tx + (corner_y - ay) * ty
     spread = jnp.abs(tx) * half_x * (corner_x == 0) + jnp.abs(ty) * half_y * (corner_y == 0)
@@ -101,14 +101,14 @@ def overlap(body: Body, wall: Wall) -> Overlap:
 
 
 def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scalar]:
-    """The motion after the deepest contact with a wall, and 1 where there was one, else 0.
+    """The motion after the deepest contact with a wall, and 1 if there was one, else 0.
 
-    `walls` is (n, 4), the ends of segments in metres; rows of NaN touch nothing. Rectangle and
+    `walls` is (n, 4), the ends of segments in metres. Rows of NaN touch nothing. Rectangle and
     segment overlap unless one of three axes separates them: the rectangle's two and the segment's
-    normal. The axis of least overlap is the contact's normal. On the segment's normal the contact
-    is the deepest corner of the rectangle, or the middle of what touches where a side lies flat;
-    else it is the deepest end of the segment. The car is moved out along the normal, and a contact
-    that approaches takes an impulse (`impulse`).
+    normal. The axis of smallest overlap is the contact's normal. If that is the segment's normal,
+    the contact is the deepest corner of the rectangle, or, if a side lies flat, the middle of the
+    touching part. Otherwise it is the deepest end of the segment. The car is moved out along the
+    normal. An approaching contact takes an impulse (`impulse`).
     """
     cosine, sine = cosine_sine(motion.heading)
 
@@ -123,7 +123,7 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
         )
 
     def score(wall: Wall) -> Scalar:
-        # Of the pieces of one wall, all equally deep, the one that has the corner is preferred.
+        # Pieces of one wall are equally deep. The piece that holds the corner is preferred.
         against = overlap(body, to_body(wall))
         return against.depth - jnp.where(against.depth > 0, PREFERENCE * against.missed, 0.0)
 
@@ -180,7 +180,7 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
 
 
 def _segments(walls: jax.Array) -> Wall:
-    """The rows as walls. Padding stands far off: it touches nothing, its derivatives are finite."""
+    """The rows as walls. Padding moves to `FAR`: it touches nothing, its derivatives are finite."""
     walls = jnp.where(jnp.isnan(walls), jnp.asarray([FAR, FAR, FAR + 1, FAR], walls.dtype), walls)
     x, y, dx, dy = walls[:, 0], walls[:, 1], walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]
     length = jnp.sqrt(dx**2 + dy**2 + 1e-18)
@@ -188,9 +188,9 @@ def _segments(walls: jax.Array) -> Wall:
 
 
 def _highest(score: Callable[[Wall], Scalar], walls: Wall) -> Wall:
-    """The wall of the highest score.
+    """The wall with the highest score.
 
-    A few are compared one by one, in scalars: a batch's look-ups by an index are slow.
+    Up to `FEW` walls are compared one by one, in scalars: indexing is slow in a batch.
     """
     count = walls.x.shape[0]
     if count > FEW:
@@ -208,19 +208,19 @@ def _highest(score: Callable[[Wall], Scalar], walls: Wall) -> Wall:
 def impulse(
     speed_n: Scalar, speed_t: Scalar, k_nn: Scalar, k_tt: Scalar, k_nt: Scalar, body: Body
 ) -> tuple[Scalar, Scalar]:
-    """The impulse (N s) along the normal and the tangent at a contact that approaches.
+    """The impulse (N s) along the normal and the tangent of an approaching contact.
 
-    Speeds of the contact before it in m/s (speed_n < 0), k the inverse masses there (1/kg). First
-    the plastic impulse (n, t), after which the contact has no normal speed: it sticks where that
-    takes |t| <= mu n; else t = -mu s n, s the sign of the slip that is left. So t takes energy out.
-    Then the wall gives back e n along the normal, e the restitution, or less where the energy
-    would rise: with what n and t took out, E, e n <= sqrt(2 E / k_nn).
+    The speeds (m/s) are the contact's before it, with speed_n < 0. k are the inverse masses there
+    (1/kg). First, the plastic impulse (n, t) removes the normal speed. The contact sticks if this
+    needs |t| <= mu n. Otherwise t = -mu s n, with s the sign of the remaining slip. So t removes
+    energy. Then the wall returns e n along the normal, with e the restitution. It returns less if
+    the energy would rise: e n <= sqrt(2 E / k_nn), with E the energy that n and t removed.
     """
     mu = body.wall_friction
     determinant = k_nn * k_tt - k_nt**2
     stick_n = (k_nt * speed_t - k_tt * speed_n) / determinant
     stick_t = (k_nt * speed_n - k_nn * speed_t) / determinant
-    n, t = -speed_n / k_nn, 0.0 * speed_t  # should neither direction of sliding last
+    n, t = -speed_n / k_nn, 0.0 * speed_t  # if sliding lasts in neither direction
     onward = jnp.where(speed_t == 0, jnp.sign(k_nt), jnp.sign(speed_t))
     for s in (-onward, onward):
         give = k_nn - mu * s * k_nt
@@ -236,5 +236,5 @@ def impulse(
 
 
 def _sign(component: jax.Array) -> jax.Array:
-    """The sign of a normal's component; 0 where it is too small to tell a corner from a side."""
+    """The sign of a normal's component. It is 0 if the component is too small: a side lies flat."""
     return jnp.where(jnp.abs(component) < 1e-6, 0.0, jnp.sign(component))

@@ -1,4 +1,4 @@
-"""What every world is asked: a car in it, a tick at a time."""
+"""The interface of every world: it moves one car, tick by tick."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -7,22 +7,21 @@ from countersteer.signals import Command, Motion, Scalar
 
 
 class Events(NamedTuple):
-    """What has happened to the car so far."""
+    """Events of the drive so far."""
 
     wall_contacts: Scalar  # separate touches of walls
     rolled_over: Scalar  # 1 from the moment the car counts as rolled over
 
 
 class World(Protocol):
-    """A car in its surroundings; a pytree, whose methods are pure and can be traced by JAX.
+    """A car in its surroundings: a pytree with pure methods that JAX can trace.
 
-    What a state is, is the world's own business. A world that has forces to show whoever looks has
-    `forces(motion)` as well.
+    Each world defines its own state. A world with contact forces to show has `forces(motion)` too.
     """
 
     @property
     def car(self) -> Car:
-        """The car that is simulated; its leaves decide the precision."""
+        """The simulated car. Its leaves decide the precision."""
         ...
 
     @property
@@ -36,17 +35,17 @@ class World(Protocol):
         velocity: tuple[Scalar, Scalar, Scalar],
         charge: Scalar,
     ) -> Any:
-        """The car at x, y, heading with velocity vx, vy, yaw rate, its wheels rolling."""
+        """The state of a car at x, y, heading with velocity vx, vy, yaw rate. Its wheels roll."""
         ...
 
     def step(self, state: Any, command: Command, tick: Scalar) -> Any:
-        """The state a tick later; `tick` counts those before it and is shared by a batch."""
+        """The state one tick later. `tick` counts the ticks before it, the same in a batch."""
         ...
 
     def motion(self, state: Any) -> Motion:
-        """All that sensors can look at."""
+        """The car's motion: all that sensors can measure."""
         ...
 
     def events(self, state: Any) -> Events:
-        """What a judge looks at besides."""
+        """The events that a judge needs besides the motion."""
         ...
