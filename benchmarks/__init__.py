@@ -1,1 +1,1 @@
-"""What makes the pages on speed and accuracy, and nobody else runs."""
+"""Scripts for the pages on speed and accuracy. Nobody else runs them: not part of the package."""

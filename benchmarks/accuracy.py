@@ -1,4 +1,4 @@
-"""Error of the position against the step: `python -m benchmarks.accuracy PAGE`."""
+"""Error of the position over the time step: `python -m benchmarks.accuracy PAGE`."""
 
 import sys
 from pathlib import Path
@@ -15,9 +15,9 @@ from countersteer.signals import Command
 from countersteer.world import planar
 
 DURATION = 1.0  # s
-FINEST = 2e-5  # s, of the solution that counts as converged
+FINEST = 2e-5  # s, step of the converged solution
 STEPS = (1e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
-SLOTS = 32768  # of the delay lines, enough for every step, so that all share one program
+SLOTS = 32768  # of the delay lines; enough for every step, so that all steps share one program
 
 
 class Manoeuvre(NamedTuple):
@@ -37,7 +37,7 @@ MANOEUVRES = (
 
 
 def positions(car: Car, dt: float) -> np.ndarray:
-    """(n, 3): x, y (m) and heading (rad) at the end of each of the manoeuvres."""
+    """x, y (m) and heading (rad) at the end of each manoeuvre: (n, 3)."""
     ends = []
     with jax.enable_x64(True):
         for manoeuvre in MANOEUVRES:
@@ -57,7 +57,7 @@ def _drive(car: Car, start: planar.State, command: Command, ticks: int, dt: floa
 
 
 def table(names: tuple[str, ...]) -> str:
-    """The page of the docs."""
+    """The text of the docs page."""
     lines = [
         "# Error of the position against the step",
         "",

@@ -1,4 +1,4 @@
-"""The world's step as C, from JAX's own trace of it: what SIMD can make of the same equations."""
+"""The world's step as C, from JAX's own trace of it: the limit of SIMD for the same equations."""
 
 import ctypes
 import subprocess
@@ -13,12 +13,12 @@ import numpy as np
 
 from countersteer.world import planar
 
-BLOCK = 64  # lanes whose numbers stay in registers and the first cache over all ticks
+BLOCK = 64  # lanes; over all ticks, their numbers stay in registers and the first cache
 WIDTH = 16  # lanes of a vector
 COMPILE = ("cc", "-O3", "-march=native", "-ffast-math", "-fPIC", "-c")
-# Apart from compiling: linked with -ffast-math, a library has the whole process flush denormals.
+# Linked separately: with -ffast-math, a library makes the whole process flush denormals.
 LINK = ("cc", "-shared")
-COMPILE_TIME = 150  # s
+COMPILE_TIME = 150  # s, limit
 
 PRELUDE = """
 #include <math.h>
@@ -44,7 +44,7 @@ static inline V v_tanh(V a) {
 }
 """
 
-CHAINS = 12  # of fused multiply-adds that do not wait for each other
+CHAINS = 12  # of fused multiply-adds; the chains are independent of each other
 PEAK = f"""
 void peak(float *out, long n) {{
   V x[{CHAINS}];
@@ -57,7 +57,7 @@ void peak(float *out, long n) {{
 
 BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/", "add_any": "+", "and": "&", "or": "|"}
 BINARY |= {"rem": "%", "gt": ">", "lt": "<", "ge": ">=", "le": "<=", "eq": "==", "ne": "!="}
-# How a primitive is written: for one number, and for a vector.
+# The C of each primitive: for one number, and for a vector
 FORMS = {name: (f"({{0}}{sign}{{1}})",) * 2 for name, sign in BINARY.items()}
 FORMS |= {
     "max": ("fmaxf({0},{1})", "v_max({0},{1})"),
@@ -82,21 +82,21 @@ FORMS |= {
 
 
 class Printer:
-    """Statements of C for a jaxpr, element by element.
+    """Prints a jaxpr as statements of C, element by element.
 
-    Values are NumPy arrays of C expressions, so shapes cost nothing; a statement in which no lane
-    takes part goes before the loop over lanes.
+    Values are NumPy arrays of C expressions, so operations on shapes cost nothing. A statement that
+    is the same for all lanes goes before the loop over lanes.
     """
 
     def __init__(self, lanes: set[str]):
-        """`lanes` are the names that differ from lane to lane."""
+        """`lanes` are the names of values that differ between lanes."""
         self.before: list[str] = []
         self.inside: list[str] = []
         self._lanes = set(lanes)
         self._known: dict[str, str] = {}
 
     def name(self, primitive: str, parts: list[str], kinds: list[str], kind: str) -> str:
-        """A variable that holds the primitive of these parts; kinds are those of NumPy's types."""
+        """A variable with the primitive's value for these parts. Kinds are NumPy's type kinds."""
         varies = any(part in self._lanes for part in parts)
         if varies:
             lift = {"f": "v_float", "i": "v_int", "b": "v_bool"}
@@ -122,7 +122,7 @@ class Printer:
         return self._known[expression]
 
     def run(self, jaxpr: Any, constants: list[Any], inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """The results' expressions."""
+        """The C expressions of the jaxpr's results."""
         values: dict[Any, np.ndarray] = dict(zip(jaxpr.invars, inputs, strict=True))
         values |= dict(zip(jaxpr.constvars, map(literal, constants), strict=True))
 
@@ -136,7 +136,7 @@ class Printer:
         return [read(atom) for atom in jaxpr.outvars]
 
     def equation(self, equation: Any, a: list[np.ndarray]) -> list[np.ndarray]:
-        """One line of the jaxpr. Raises `NotImplementedError` on a primitive it does not know."""
+        """The results of one equation. Raises `NotImplementedError` for an unknown primitive."""
         primitive, options = equation.primitive.name, equation.params
         inner = options.get("jaxpr") or options.get("call_jaxpr")
         if inner is not None:
@@ -171,7 +171,7 @@ class Printer:
     def each(
         self, primitive: str, a: list[np.ndarray], shape: tuple[int, ...], kinds: Any, kind: str
     ) -> np.ndarray:
-        """A primitive of each element."""
+        """A primitive applied to each element."""
         parts = [np.broadcast_to(part, shape) for part in a]
         out = np.empty(shape, object)
         for index in np.ndindex(shape):
@@ -192,10 +192,10 @@ def literal(value: Any) -> np.ndarray:
 
 
 class Native:
-    """A fleet driven by compiled C, its cars spread over threads."""
+    """A fleet driven by compiled C, with its cars spread over threads."""
 
     def __init__(self, fleet: Any, threads: int):
-        """Compiles. Raises `RuntimeError` where the compiler fails or takes too long."""
+        """Compile the step. Raises `RuntimeError` if the compiler fails or takes too long."""
         one = jax.tree.map(lambda leaf: leaf[0], (fleet.states, fleet.commands))
         step = jax.make_jaxpr(partial(planar.step, dt=fleet.dt))(
             fleet.car, fleet.walls, *one, np.int32(0)
@@ -264,7 +264,7 @@ class Native:
         self._same = self._same.astype(np.float32)
 
     def run(self, ticks: int) -> np.ndarray:
-        """All cars' numbers after so many ticks: (cars, states in the pytree's order)."""
+        """All cars' numbers after `ticks` ticks: (cars, numbers in the pytree's order)."""
 
         def part(start: np.ndarray) -> np.ndarray:
             state = start.copy()
@@ -282,7 +282,7 @@ class Native:
         return whole
 
     def peak(self, rounds: int) -> float:
-        """Does fused multiply-adds on all threads, and says how many operations that were."""
+        """Run fused multiply-adds on all threads. Returns the number of operations."""
         threads = len(self._start)
 
         def part(_: int) -> None:

@@ -1,4 +1,4 @@
-"""What a compiled batch does in a step, counted from XLA's own text of the program."""
+"""The operations of a compiled batch in a step, counted from XLA's own text of the program."""
 
 import re
 from collections import Counter
@@ -10,11 +10,11 @@ BYTES = {"f32": 4, "s32": 4, "u32": 4, "pred": 1}
 
 
 def profile(text: str, lanes: int) -> dict[str, Any]:
-    """Of the loop over ticks in which most is done on blocks of so many lanes.
+    """Count the loop over ticks, which is the computation with the most kernels.
 
-    `kernels` are the loops over lanes in a tick, `operations` those on each lane by name, `flops`
-    the sum of the arithmetic ones, and `bytes` what a lane's numbers between kernels come to, each
-    read or written once a kernel.
+    `lanes` is the size of a block. `kernels` are the loops over lanes in a tick. `operations` are
+    those on each lane, by name, and `flops` is the sum of the arithmetic ones. `bytes` is the size
+    of a lane's numbers between kernels, each read or written once in a kernel.
     """
     computations = dict(
         re.findall(r"(?ms)^(?:ENTRY )?(%?[\w.\-]+) \([^\n]*\{\n(.*?)^\}", text.replace("%", ""))

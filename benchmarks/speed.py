@@ -1,4 +1,4 @@
-"""docs/speed.md: the bench, with more sides, and what bounds the planar batch.
+"""Write docs/speed.md: the bench with more sides, and the limits of the planar batch.
 
 python -m benchmarks.speed docs/speed.md
 """
@@ -27,7 +27,7 @@ from countersteer.progress import Progress
 from countersteer.signals import Command
 from countersteer.world import planar
 
-LARGE_DT = 5e-3  # s: the largest step of docs/accuracy.md that may do
+LARGE_DT = 5e-3  # s, largest step of docs/accuracy.md with a usable error
 GROWTH = (1, 8, 64, 512, 2048, 8192, 32768)  # cars
 
 
@@ -71,7 +71,7 @@ def planar_side(size: Size) -> Iterator[dict[str, Any]]:
 
 
 def manoeuvres(fleet: Fleet, program: Any, ticks: int) -> list[list[float]]:
-    """Where (x and y, m) the lanes are at the end of the manoeuvres of docs/accuracy.md."""
+    """Positions x, y (m) at the end of each manoeuvre of docs/accuracy.md."""
     begins = [planar.initial_state(fleet.car, fleet.dt, velocity=m.velocity) for m in MANOEUVRES]
     lanes = np.arange(fleet.cars) % len(begins)
     states = jax.tree.map(lambda *leaves: np.stack(leaves)[lanes].astype(np.float32), *begins)
@@ -95,7 +95,7 @@ def plain_side(size: Size) -> Iterator[dict[str, Any]]:
 
 
 def native_side(size: Size) -> Iterator[dict[str, Any]]:
-    """The same equations as C, compiled for this machine's vectors; and the machine's peak."""
+    """The same equations as C, compiled for this machine's vectors, and the machine's peak."""
     native = Native(Fleet(size.cars, 1), cores())
     work = float(native.cars * size.ticks)
     rounds = 1_000_000
@@ -118,14 +118,14 @@ SIDES: dict[str, Callable[[Size], Iterator[dict[str, Any]]]] = {
 
 
 def missing_sides() -> dict[str, str]:
-    """Those that cannot be run here, and why."""
+    """The sides that cannot run here, with the reason."""
     return bench.missing_sides() | (
         {"native": "no C compiler (cc)"} if shutil.which("cc") is None else {}
     )
 
 
 def measure(size: Size, show: Callable[[float, float], None]) -> dict[str, Any]:
-    """What `bench` finds, and more."""
+    """The result of `bench`, with further figures."""
     measured = bench.measure(size, show, "benchmarks.speed", list(SIDES), missing_sides())
     found, facts = bench.result(measured), measured.facts
     growth = {n: found.pop(f"lanes_{n}", found["planar_batch_steps_per_s"]) for n in GROWTH}
@@ -143,7 +143,7 @@ def measure(size: Size, show: Callable[[float, float], None]) -> dict[str, Any]:
 
 
 def error_mm(ends: list[list[float]], converged: list[list[float]]) -> float:
-    """The largest distance between where manoeuvres end and where they should (mm)."""
+    """The largest distance between the ends of manoeuvres and their converged ends (mm)."""
     return 1e3 * float(np.max(np.hypot(*(np.array(ends) - np.array(converged)).T)))
 
 
@@ -165,7 +165,7 @@ ROWS = (
 
 
 def page(found: dict[str, Any], picture: str) -> str:
-    """docs/speed.md."""
+    """The text of docs/speed.md."""
     at, samples, counted = found["machine"], found["samples"], found["profile"]
     versions = ", ".join(f"{name} {version}" for name, version in at["versions"].items())
     text = [
@@ -260,7 +260,7 @@ def bounds(found: dict[str, Any], counted: dict[str, Any]) -> list[str]:
 
 
 def draw(found: dict[str, Any], file: Path) -> None:
-    """The rate against the number of cars."""
+    """Draw the rate over the number of cars."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -288,7 +288,7 @@ def draw(found: dict[str, Any], file: Path) -> None:
 
 
 def write_page(found: dict[str, Any], file: Path) -> None:
-    """The page, and its picture beside it."""
+    """Write the page, and its picture beside it."""
     picture = file.with_suffix(".png")
     draw(found, picture)
     file.write_text(page(found, picture.name))

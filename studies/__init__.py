@@ -1,1 +1,1 @@
-"""Studies that make pages of the docs; nobody else runs them, so they are not in the package."""
+"""Studies that make pages of the docs. Nobody else runs them, so they are not in the package."""

@@ -1,9 +1,9 @@
-"""What the estimates are worth, and the drives on them: `make estimation` writes the page.
+"""The accuracy of the estimates, and of drives on them: `make estimation` writes the page.
 
-All in closed loop, with the drift-turn driver on the velocity filter, over cars of a set that
-differ from the nominal one. Four studies, each a function that gives the lines of its section:
-the errors of the filters, sensors that fail on a straight, straightening by sonar and by filter,
-and what better sensors would bring.
+All drives are in closed loop, with the drift-turn driver on the velocity filter. Their cars are
+drawn from a set and differ from the nominal one. There are five studies. Each is a function that
+gives the lines of its section: errors of the filters, the pose from anywhere, sensors that fail on
+a straight, straightening by sonar and by filter, and the benefit of better sensors.
 """
 
 import math
@@ -39,9 +39,9 @@ from studies.watches import FIT, PARTICLES, SAMPLE, Errors, Places, anywhere
 
 SET, SPEEDS, COURSES = "around", (1.5, 3.0), ("box", "ess")
 CARS = 256  # of each course
-FIRST = 5000  # seed: the filters' noises were set on those from 0 to 255
+FIRST = 5000  # first seed; the filters' noises were set on seeds 0 to 255
 POSES = 128  # drives of each course with a pose filter, which is slow
-FAULT = 0.5  # s that a sensor fails
+FAULT = 0.5  # s, duration of a sensor's fault
 FAILING = 8  # cars for each sensor, kind and straight
 SENSORS = (
     "sonar_front",
@@ -57,23 +57,23 @@ Make = Callable[[Course, Car, float | None], Driver]
 
 
 def trials(course: Course, car: Car, seeds: Sequence[int]) -> Trials:
-    """The trials that all studies are made of."""
+    """The trials of all studies."""
     cars = load_population(SET)
     return Trials(course, car, car, cars, seeds, SPEEDS, 1, ONBOARD, "filter", 0.001)
 
 
 def drawn(of: Trials) -> Drawn:
-    """What they draw."""
+    """The random cars of the trials."""
     return draw(of.population, of.car, of.course, of.seeds, np.float32, of.speeds)
 
 
 def rms(values: Any) -> float:
-    """Root of the mean square, of what is a number."""
+    """Root mean square of the values that are not NaN."""
     return math.sqrt(float(np.nanmean(np.square(np.asarray(values, float)))))
 
 
 def errors(course: Course, car: Car, seeds: Sequence[int], make: Make = drift_turn) -> Any:
-    """Scores, and what `watches.Errors` has kept, of one drive for each seed."""
+    """Scores, and the result of `watches.Errors`, of one drive for each seed."""
     legs = jax.tree.map(np.float32, legs_of(course, 1))
     sonar = jax.tree.map(np.float32, car.sensors.sonar)
     watch = Errors(legs=legs, sonar=sonar, inside=np.float32(chi2.ppf(0.95, 3)))
@@ -95,9 +95,9 @@ def figures(of: Trials, kept: Any) -> dict[str, float]:
     def per(total: np.ndarray, count: np.ndarray) -> float:
         return math.sqrt(float(np.sum(total)) / max(float(np.sum(count)), 1.0))
 
-    # A car's errors hang together over a drive, so a drive counts as one draw of three.
+    # A car's errors are correlated over a drive. So a drive counts as one draw of three numbers.
     low, high = (float(chi2.ppf(p, 3 * len(each))) / len(each) for p in (0.025, 0.975))
-    timed = np.sum(np.isfinite(kept.squares), axis=0) == len(each)  # until the first is done
+    timed = np.sum(np.isfinite(kept.squares), axis=0) == len(each)  # until the first drive ends
     means = np.mean(kept.squares[:, timed], axis=0)
     return {
         "drives": len(each),
@@ -136,7 +136,7 @@ def figures(of: Trials, kept: Any) -> dict[str, float]:
 
 
 def filters(car: Car, seeds: Sequence[int], picture: Path | None) -> list[str]:
-    """The filters' errors."""
+    """The section on the filters' errors."""
     found, squares = {}, {}
     for name in COURSES:
         course = load_course(name)
@@ -207,7 +207,7 @@ def filters(car: Car, seeds: Sequence[int], picture: Path | None) -> list[str]:
 
 
 def poses(car: Car, seeds: Sequence[int]) -> list[str]:
-    """The pose from a uniform start."""
+    """The section on the pose from a uniform start."""
     lines = [
         "| course | drives of two turns | settled, up to symmetry (95 %) | at the one place | "
         "median share of the weight |",
@@ -229,7 +229,7 @@ def poses(car: Car, seeds: Sequence[int]) -> list[str]:
 
 
 def settled(course: Course, car: Car, seeds: Sequence[int]) -> tuple[Any, np.ndarray]:
-    """What `watches.Places` has kept, and which drives made two turns."""
+    """The result of `watches.Places`, and a mask of the drives that made two turns."""
     walls = jnp.asarray(padded(course.walls, np.dtype(np.float32)))
     place = PoseFilter(walls=walls, sonar=jax.tree.map(np.float32, car.sensors.sonar))
     alike = NAMES.get(course.name, (1, ""))[0]
@@ -248,10 +248,10 @@ def settled(course: Course, car: Car, seeds: Sequence[int]) -> tuple[Any, np.nda
 def failing(
     course: Course, car: Car, cars: int, sensors: Sequence[str] = SENSORS
 ) -> dict[tuple[str, str], np.ndarray]:
-    """(cars, straights) of statuses for each sensor and kind; and ("none", "") without a fault.
+    """The outcomes for each sensor and kind: (cars, straights). ("none", "") has no fault.
 
-    A fault begins 0.4 s after the start, or as a turn ends, and lasts half a second. One program
-    holds all faults, each of no duration but in its own trials.
+    A fault begins 0.4 s after the start, or at the end of a turn, and lasts half a second. One
+    program holds all faults. Outside its own trials, a fault has no duration.
     """
     pairs = [(sensor, kind) for sensor in sensors for kind in KINDS]
     count = len(course.turns_ahead(1))
@@ -268,7 +268,7 @@ def failing(
     none = np.full(cars, -1)
     sound = run(none, 0.0 * none, seeds)
     begins = np.concatenate([np.full((cars, 1), 0.4), sound.turns.end[:, : count - 1]], axis=1)
-    # A straight that the sound car never came to has no fault.
+    # A straight that the car without a fault never reached gets no fault.
     begins = np.where(np.isfinite(begins), begins, 1e6)
     shape = (len(pairs), cars, count)
     which, car_number, straight = (axis.ravel() for axis in np.indices(shape))
@@ -279,7 +279,7 @@ def failing(
 
 
 def sensor_faults(car: Car, cars: int) -> list[str]:
-    """Sensors that fail on a straight of `box`."""
+    """The section on sensors that fail on a straight of `box`."""
     found = failing(load_course("box"), car, cars)
     lines = ["| sensor | " + " | ".join(KINDS) + " |", "| --- |" + " ---: |" * len(KINDS)]
 
@@ -307,7 +307,7 @@ def sensor_faults(car: Car, cars: int) -> list[str]:
 
 
 def straightening(car: Car, seeds: Sequence[int]) -> list[str]:
-    """PID on sonar beside the wall filter."""
+    """The section on straightening: PID on sonar, and on the wall filter."""
     lines = [
         "| | offset, RMS | angle, RMS | as known: offset | angle | success | heading error, RMS |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
@@ -337,7 +337,7 @@ def straightening(car: Car, seeds: Sequence[int]) -> list[str]:
     return lines
 
 
-SENSING = (  # what the car has, its sensors set so, and what the driver keeps its corridor by
+SENSING = (  # a car's sensors in words, their settings, and the driver's source for its corridor
     ("the sensors as they are", (), "filter"),
     ("a lidar of 72 beams over 270°, 40 Hz, 10 mm", ("sensors.lidar.beams=72",), "filter"),
     (
@@ -359,7 +359,7 @@ SENSING = (  # what the car has, its sensors set so, and what the driver keeps i
 
 
 def sensing(name: str, seeds: Sequence[int]) -> list[str]:
-    """The headline figures with better sensors."""
+    """The section on better sensors: their headline figures."""
     lines = [
         "| | course | success (95 %) | drifts | heading error, RMS |",
         "| --- | --- | ---: | ---: | ---: |",
@@ -382,7 +382,7 @@ def sensing(name: str, seeds: Sequence[int]) -> list[str]:
 
 
 def draw_picture(squares: dict[str, np.ndarray], path: Path) -> None:
-    """The normalised error squared over time, a dot an instant, between its bounds."""
+    """Draw the normalised error squared over time, a dot for each instant, with its bounds."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -475,7 +475,7 @@ filter's states, and the driver takes offset, angle and corner from the pose.
 
 
 def write(page: Path, name: str = "rx7", cars: int = CARS) -> None:
-    """The page, and the picture beside it."""
+    """Write the page, and the picture beside it."""
     car, seeds = load_car(name), range(FIRST, FIRST + cars)
     studies = {
         "filters": filters(car, seeds, page.with_suffix(".png")),

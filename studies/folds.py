@@ -1,10 +1,10 @@
-"""Every window of some logs predicted by a car that was not fitted to it.
+"""Cross-validation: every window of some logs, predicted by a car that was not fitted to it.
 
-`python -m studies.folds PAGE BASE RUN...` fits three times, from BASE (and the cars
-of other floors beside it). Each time another third is left out: of a longer log every third block
-of time, and of brief logs, which are a manoeuvre each, every third file. What is told of each log
-is pooled over the three, so all of it was judged where it was not fitted. How full the battery was
-is taken from a log's fitted windows, or of a file that was left out from its own.
+`python -m studies.folds PAGE BASE RUN...` fits three times, from BASE (and the cars of other floors
+beside it). Each fit leaves out another third: every third block of time of a longer log, and every
+third file of the brief logs, which are one manoeuvre each. The errors of each log are pooled over
+the three fits, so all of them are outside the fit. The battery charge is from a log's fitted
+windows, or for a file left out, from its own windows.
 """
 
 import sys
@@ -27,15 +27,15 @@ FOLDS = 3
 
 
 class Judged(NamedTuple):
-    """What was left out of a log: absolute errors at the windows' ends, (windows, quantities)."""
+    """The windows left out of a log: absolute errors at their ends, (windows, quantities)."""
 
     simulated: np.ndarray
-    unchanged: np.ndarray  # by predicting that nothing changes
-    transient: np.ndarray
+    unchanged: np.ndarray  # of persistence
+    transient: np.ndarray  # mask (windows,)
 
 
 def kinds(logs: tune.Logs, fold: int) -> np.ndarray:
-    """As `fit.blocks` has it, with every third of the brief logs held out whole."""
+    """The kinds of `fit.blocks`, with every third of the brief logs held out whole."""
     kind = fit.blocks(logs.start, logs.run, fold)
     short = fit.brief(logs.start, logs.run)
     if short.all():
@@ -46,7 +46,7 @@ def kinds(logs: tune.Logs, fold: int) -> np.ndarray:
 
 
 def judged(cars: dict[str, Car], held: tune.Logs) -> dict[int, Judged]:
-    """Errors by log, over windows whose charge is known."""
+    """Errors by log, over windows with a known charge."""
     shots = held.shots
     end = shots.measured[:, :, -1]
     start = np.stack([*shots.velocity, shots.wheel_speed], axis=1)
@@ -61,7 +61,7 @@ def judged(cars: dict[str, Car], held: tune.Logs) -> dict[int, Judged]:
 def cross_validate(
     logs: tune.Logs, cars: dict[str, Car], base: str, report: Callable[[str], None]
 ) -> tuple[dict[int, Judged], dict[int, float]]:
-    """By log, its windows; by brief log, the RMS error of the wheel speed over the whole of it."""
+    """By log: its windows. By log that a fit left out: its RMS error of the wheel speed."""
     parts: dict[int, list[Judged]] = {}
     whole: dict[int, float] = {}
     for fold in range(FOLDS):
@@ -88,7 +88,7 @@ def cross_validate(
 
 
 def page(logs: tune.Logs, pooled: dict[int, Judged], whole: dict[int, float], base: str) -> str:
-    """The page of the docs."""
+    """The text of the docs page."""
     names = ("forward, m/s", "lateral, m/s", "yaw rate, rad/s", "wheels, m/s")
     lines = [
         "# Logs predicted by cars that were not fitted to them",
@@ -126,7 +126,7 @@ def _median(off: np.ndarray, still: np.ndarray) -> str:
 
 
 def read(base: str, paths: Sequence[Path]) -> tuple[tune.Logs, dict[str, Car]]:
-    """The logs, and the cars of their floors."""
+    """Read the logs, and the cars of their floors."""
     runs = [read_run(path) for path in paths]
     name = Path(base).stem
     named = {str(run.about.get("car_name", name)) for run in runs} - {name}
@@ -135,7 +135,7 @@ def read(base: str, paths: Sequence[Path]) -> tuple[tune.Logs, dict[str, Car]]:
 
 
 def main(arguments: Sequence[str]) -> Any:
-    """The command."""
+    """Run the command."""
     out, base, *paths = arguments
     configure_jax(blocks=True)
     with jax.enable_x64(True):

@@ -1,10 +1,10 @@
-"""Known cars found again from their logs: `python -m studies.recovery PAGE`.
+"""Known cars, recovered from their logs: `python -m studies.recovery PAGE`.
 
-What a fit says of its deviations is put to the test where the truth is known. Each of some cars
-differs from a base in every parameter that is fitted, at random. It drives three short logs of
-random launches, curves and slides, seen by motion capture with noise and by the car's own sensors,
-and `fit.fit` starts from the base. Each parameter that it calls determined should lie within a
-deviation of the truth in two of three cases, and within three in all but a few of a thousand.
+This study tests the deviations of a fit against a known ground truth. Each car differs from a base
+at random, in every fitted parameter. It drives three short logs of random launches, curves and
+slides. Noisy motion capture and the car's own sensors record them. `fit.fit` starts from the base.
+A parameter that it calls determined should lie within one deviation of the truth in two of three
+cases, and within three deviations in all but a few of a thousand.
 """
 
 import sys
@@ -32,15 +32,15 @@ from countersteer.tuning.tune import read_logs
 
 BASE = "jetracer-tape"
 CARS = 20
-LOGS, DURATION, BLOCK = 3, 9.0, 1.5  # of each car; s; s at the same command
+LOGS, DURATION, BLOCK = 3, 9.0, 1.5  # logs of each car; s of a log; s of a command
 EVERY = 0.5  # s between the starts of windows
-RANDOM = 0.15  # of a value, to either side, or this part of what was likely beforehand
+RANDOM = 0.15  # largest change, as a part of the value or of its prior deviation (`ABSOLUTE`)
 CAPTURE_EVERY = 2  # samples of the record: 100 Hz
 CAPTURE_NOISE = (0.0005, 0.0005, 0.002)  # m, m, rad: standard deviation of a pose
 
 
 class Case(NamedTuple):
-    """A parameter of a car, and what its fit says of it."""
+    """A parameter of a car, and its fit."""
 
     path: str
     true: float
@@ -55,7 +55,7 @@ class Case(NamedTuple):
 
 
 def random_car(base: Car, free: Sequence[str], rng: np.random.Generator) -> Car:
-    """The base with all of `free` moved at random, inside their ranges."""
+    """The base with all parameters of `free` changed at random, within their ranges."""
     for path in free:
         value, declared = fit.value_of(base, path), fit.declaration(path)
         reach = RANDOM * fit.ABSOLUTE.get(path, abs(value))
@@ -65,7 +65,7 @@ def random_car(base: Car, free: Sequence[str], rng: np.random.Generator) -> Car:
 
 
 def log(car: Car, folder: Path, rng: np.random.Generator) -> Run:
-    """A drive of the car by random commands, as motion capture and its sensors tell of it."""
+    """A drive of the car by random commands, recorded by motion capture and its sensors."""
     times = np.concatenate([[0.0, 0.3], np.arange(BLOCK, DURATION, BLOCK)])
     throttle = np.append(0.0, rng.uniform(0.25, 0.9, len(times) - 1))
     steering = np.append(0.0, np.radians(rng.uniform(-25, 25, len(times) - 1)))
@@ -79,7 +79,7 @@ def log(car: Car, folder: Path, rng: np.random.Generator) -> Run:
 
 
 def measured(run: Run, rng: np.random.Generator) -> Run:
-    """The run as a log of a real car: noisy poses for the state, and the encoder as it is."""
+    """The run as a log of a real car: noisy poses instead of the state, the encoder as it is."""
     assert run.truth is not None
     assert run.telemetry is not None
     poses = {"time_s": run.truth["time_s"][::CAPTURE_EVERY]}
@@ -96,7 +96,7 @@ def measured(run: Run, rng: np.random.Generator) -> Run:
 def recovered(
     seed: int, what: str = "all", report: Callable[[str], None] = lambda _: None
 ) -> list[Case]:
-    """What a fit makes of the car with this seed. Parameters' values are those used inside."""
+    """The fit of the car with this seed. Values are in the units used inside."""
     rng = np.random.default_rng(seed)
     base = load_car(BASE)
     true = random_car(base, fit.STAGES[what].parameters, rng)
@@ -111,7 +111,7 @@ def recovered(
 
 
 def page(cases: Sequence[Case], cars: int, what: str) -> str:
-    """The page of the docs."""
+    """The text of the docs page."""
     determined = [case for case in cases if case.determined]
     within = [sum(case.off <= most for case in determined) for most in (1, 2, 3)]
     lines = [

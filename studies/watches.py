@@ -1,6 +1,6 @@
-"""What is looked at beside the judge while trials run: errors of the estimates, and the pose.
+"""Observers beside the judge of trials: for errors of the estimates, and for the pose.
 
-Each is a `trials.Watch`. Sums are kept, not records, so that thousands of trials fit.
+Each is a `trials.Watch`. It keeps sums instead of records, so that thousands of trials fit.
 """
 
 import dataclasses
@@ -26,23 +26,23 @@ from countersteer.simulator import heard
 from countersteer.task.judge import PERIOD
 from countersteer.world.chassis import Vector, dot, solve
 
-SLIPS = math.radians(10)  # sideslip from which on the car drifts
-FASTER = 0.5  # m/s, below which sideslip means nothing
-WARM = 0.5  # s from the start that are not looked at
-SAMPLE, SAMPLES = 20, 240  # looks between two samples of the normalised error, and how many
-FIT = 0.05  # m within which a ping is of the wall that it should be of
+SLIPS = math.radians(10)  # sideslip; above it, the car drifts
+FASTER = 0.5  # m/s; below it, sideslip has no meaning
+WARM = 0.5  # s after the start that are left out
+SAMPLE, SAMPLES = 20, 240  # looks between two samples of the normalised error; number of samples
+FIT = 0.05  # m; a ping closer to the expected wall is of that wall
 PARTICLES = 2000
-SETTLED = (0.3, math.radians(15))  # m and rad from the truth
+SETTLED = (0.3, math.radians(15))  # m and rad, largest error of a settled pose
 
 
 class Kept(NamedTuple):
-    """Sums over the looks at a trial, and what the next look needs."""
+    """Sums over the looks at a trial, and the memory for the next look."""
 
     drifting: Scalar  # looks in drifts
     slip: Scalar  # squared errors of the sideslip in them
     reckoned: Scalar  # the same of dead reckoning
     looks: Scalar
-    inside: Scalar  # of them within the 95 % of the covariance
+    inside: Scalar  # looks with errors inside the covariance's 95 %
     alone: tuple[Scalar, ...]  # squared errors of vx, vy, yaw rate over each one's variance
     squares: Array  # (SAMPLES,) normalised error squared of vx, vy, yaw rate; NaN: none
     straight: Scalar  # looks on straights
@@ -52,28 +52,28 @@ class Kept(NamedTuple):
     angle_normal: Scalar
     offset: Scalar  # squared, of the car
     angle: Scalar
-    pings: Scalar  # of the front sonar that are of the wall that it should be of
-    alarms: Scalar  # of these held for spikes by `spikes`
-    doubts: Scalar  # and by the driver
-    strays: Scalar  # that are not, and shorter
-    passed: Scalar  # of these believed by `spikes`
+    pings: Scalar  # of the front sonar from the expected wall
+    alarms: Scalar  # these pings, if `spikes` takes them for spikes
+    doubts: Scalar  # the same, if the driver doubts them
+    strays: Scalar  # front pings shorter than to the expected wall
+    passed: Scalar  # strays that `spikes` believes
     estimate: Estimate  # the last
     charge: Scalar
     reckoning: dead_reckoning.ReckoningMemory
     spike: spikes.SpikeMemory
-    sound: Scalar  # whether the ping at the last look was
+    sound: Scalar  # 1 if the last look had a ping from the expected wall
 
 
 @pytree
 class Errors:
-    """Errors of what the driver is told, in a loop whose estimate is the velocity filter."""
+    """Errors of the driver's estimates, in a loop whose estimator is the velocity filter."""
 
     legs: Legs
     sonar: Sonar  # the nominal car's
     inside: Scalar  # 95 % of a chi-squared distribution with three degrees of freedom
 
     def begin(self, now: Instant) -> Kept:
-        """Nothing yet."""
+        """An empty record."""
         m = now.simulator.world.motion(now.loop.state)
         dtype = jnp.result_type(m.x)
         zero = jnp.zeros((), dtype)
@@ -88,7 +88,7 @@ class Errors:
         )
 
     def look(self, now: Instant, kept: Kept) -> Kept:
-        """One instant more."""
+        """The record with one more instant."""
         motion, dt = now.simulator.world.motion(now.loop.state), now.simulator.dt
         _, seen = now.pilot.observe(now.memory, heard(now.simulator, now.loop), now.loop.tick)
         told = jax.tree.map(lambda value: jnp.asarray(value, motion.charge.dtype), seen.estimate)
@@ -129,7 +129,7 @@ class Errors:
         speed = jnp.sqrt(motion.vx**2 + motion.vy**2)
         spike = spikes.update(kept.spike, front, PERIOD * speed, self.sonar.noise)
         held = spike.believed != front.value
-        # The driver has heard by now what came at the last look.
+        # By now the driver has received the ping of the last look.
         doubted = (kept.sound > 0) & (own.doubts > 0) & goes_on
 
         one = lambda true: jnp.where(true, 1.0, 0.0)  # noqa: E731  # used five times
@@ -166,24 +166,24 @@ class Errors:
         )
 
     def end(self, kept: Kept) -> Kept:
-        """All of it."""
+        """The whole record."""
         return kept
 
 
 class Placed(NamedTuple):
-    """How far the pose filter's best hypothesis is from each place that looks alike."""
+    """Distances of the pose filter's best hypothesis from each of the places that look alike."""
 
     distance: Array  # (places,) m, at the end of the second turn
     angle: Array  # (places,) rad
-    share: Scalar  # of the weight
-    settled_at: Scalar  # s, from which on it never was off again; inf
+    share: Scalar  # of the hypothesis in the weight
+    settled_at: Scalar  # s, start of the last settled time; inf: not settled
 
 
 @pytree
 class Places:
     """A pose filter that starts from anywhere on the course, beside the loop.
 
-    `turns` holds the angles by which the course can be turned about `middle` into itself.
+    `turns` holds the angles of rotation about `middle` that map the course onto itself.
     """
 
     place: pose.PoseFilter
@@ -193,7 +193,7 @@ class Places:
     particles: int = dataclasses.field(default=PARTICLES, metadata={"static": True})
 
     def begin(self, now: Instant) -> tuple[pose.Cloud, Placed]:
-        """Anywhere; each trial with noise of its own."""
+        """A cloud anywhere on the course, with noise of its own for each trial."""
         motion = now.simulator.world.motion(now.loop.state)
         zero = jnp.zeros_like(motion.x)
         still = Estimate(zero, zero, motion.heading, zero, zero, zero)
@@ -206,7 +206,7 @@ class Places:
         return cloud, Placed(none, none, zero, zero + jnp.inf)
 
     def look(self, now: Instant, kept: tuple[pose.Cloud, Placed]) -> tuple[pose.Cloud, Placed]:
-        """One instant more: the cloud steps at its own period."""
+        """The record with one more instant. The cloud steps at its own period."""
         every = round(pose.PERIOD / now.simulator.dt)
 
         def step(kept: tuple[pose.Cloud, Placed]) -> tuple[pose.Cloud, Placed]:
@@ -233,12 +233,12 @@ class Places:
         return jax.lax.cond(now.loop.tick % every == 0, step, lambda same: same, kept)
 
     def end(self, kept: tuple[pose.Cloud, Placed]) -> Placed:
-        """Without the cloud."""
+        """The result, without the cloud."""
         return kept[1]
 
 
 def _slim(estimate: Estimate) -> Estimate:
-    """What the pose filter needs, all of one type."""
+    """The fields that the pose filter needs, all of one type."""
     dtype = jnp.result_type(estimate.x)
     slim = Estimate(*estimate[:6])._replace(velocity_covariance=estimate.velocity_covariance)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), slim)

@@ -23,16 +23,16 @@ from typing import Any
 __version__ = "0.1.0"
 
 _NAMES = {
-    "drive": "face",
-    "evaluate": "face",
+    "drive": "api",
+    "evaluate": "api",
     "load_car": "car.files",
     "load_course": "course.files",
-    "load_driver": "face",
-    "load_run": "face",
-    "Run": "face",
+    "load_driver": "api",
+    "load_run": "api",
+    "Run": "api",
     "Simulator": "simulator",
     "Pilot": "pilot",
-    "Task": "task.task",
+    "Task": "task.judge",
     "Command": "signals",
     "Observation": "drivers.driver",
     "InputError": "errors",

@@ -1,4 +1,4 @@
-"""What `import countersteer` gives: a drive, an evaluation, and what they are made of, by name."""
+"""The functions of `import countersteer`: a drive, an evaluation, and their parts by name."""
 
 import html
 import os
@@ -31,14 +31,14 @@ from countersteer.viewing.view import view_of
 
 
 class Run:
-    """A drive that was recorded: simulated, imported or real. In a notebook it shows its report.
+    """A recorded drive: simulated, imported or real. In a notebook it shows its report.
 
-    `columns` are those of `truth.csv` (NumPy arrays, units in the names), `commands` and
-    `telemetry` the other tables, `about` is `run.toml`, `folder` says where all of it is.
+    `columns` are those of `truth.csv` (NumPy arrays, units in the names). `commands` and
+    `telemetry` are the other tables, `about` is `run.toml`. `folder` is the path of all files.
     """
 
     def __init__(self, folder: RunFolder) -> None:
-        """From a folder that was read."""
+        """From the content of a run's folder."""
         self.folder, self.about = folder.path, folder.about
         self.commands, self.telemetry = folder.commands, folder.telemetry
         self.columns: dict[str, np.ndarray] = folder.truth or {}
@@ -51,7 +51,7 @@ class Run:
 
     @property
     def success(self) -> bool:
-        """Whether it reached its goal and touched no wall."""
+        """Whether the car reached its goal and touched no wall."""
         return bool(self._summary.get("success", False))
 
     @property
@@ -60,7 +60,7 @@ class Run:
         return list(self._summary.get("turns", []))
 
     def to_pandas(self) -> Any:
-        """The columns as a data frame. Raises `ImportError` where pandas is missing."""
+        """The columns as a data frame. Raises `ImportError` if pandas is missing."""
         try:
             import pandas  # type: ignore[import-untyped]  # no package of ours needs it
         except ImportError:
@@ -68,18 +68,18 @@ class Run:
         return pandas.DataFrame(dict(self.columns))
 
     def __repr__(self) -> str:
-        """In a line."""
+        """The run in one line."""
         end = float(self.columns["time_s"][-1]) if len(self.columns) else 0.0
         return f"<Run {self.folder}: {self.outcome}, {len(self.turns)} turns, {end:.2f} s>"
 
     def _repr_html_(self) -> str:
-        """The report, playing."""
+        """The report page, for a notebook."""
         page = html.escape((self.folder / "report.html").read_text(encoding="utf-8"))
         return f'<iframe srcdoc="{page}" width="100%" height="760" frameborder="0"></iframe>'
 
 
 def load_run(folder: str | Path) -> Run:
-    """A run's folder. Raises `InputError` where it is not one."""
+    """The run in a folder. Raises `InputError` if it is not a run's folder."""
     return Run(read_run(Path(folder)))
 
 
@@ -105,11 +105,11 @@ def drive(
     dt: float = 0.001,
     out: str | Path | None = None,
 ) -> Run:
-    """Drives once and records it, as `countersteer drive` does; names are those of its options.
+    """Drive once and record it, as `countersteer drive` does. Names are those of its options.
 
-    `set` overrides parameters of the simulated car (`"battery.wear=0.3"`), which the driver is not
-    told of. `speed` in m/s, `battery` is the charge from 0 to 1, `dt` in seconds. The run's folder
-    is `out`, or a new one under `runs/`. Raises `InputError` with one line where an input is wrong.
+    `set` overrides parameters of the simulated car (`"battery.wear=0.3"`). The driver does not know
+    them. `speed` is in m/s, `battery` is the charge from 0 to 1, `dt` is in seconds. The run's
+    folder is `out`, or a new one under `runs/`. Raises `InputError` with one line for wrong input.
     """
     configure_jax(batches=False, cores=2)
     where, simulated = load_course(course), load_car(car, set)
@@ -152,9 +152,9 @@ def evaluate(
     link: str = "onboard",
     dt: float = 0.001,
 ) -> dict[str, Any]:
-    """A driver over random cars, as `countersteer evaluate` does: what its JSON has of one driver.
+    """Evaluate a driver on random cars. Returns what `countersteer evaluate --json` has of it.
 
-    `speed` is a range in m/s. Fastest as the first thing that a process does with JAX.
+    `speed` is a range in m/s. It is fastest as the first use of JAX in a process.
     """
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     where, nominal = load_course(course), load_car(car)
@@ -170,7 +170,7 @@ def evaluate(
 
 
 def _check(**choices: tuple[str, Iterable[str]]) -> None:
-    """Raises `InputError` where an argument is none of those that there are."""
+    """Raise `InputError` if a value is not one of its choices."""
     for name, (value, known) in choices.items():
         if value not in known:
             raise InputError(f"{name} must be one of {', '.join(known)}, not {value!r}")

@@ -1,4 +1,4 @@
-"""What the judge says of a run that is a folder: simulated, imported or real."""
+"""Judges a run's folder: simulated, imported or real."""
 
 import dataclasses
 from typing import Any
@@ -15,10 +15,10 @@ from countersteer.tuning.windows import read_measured
 
 
 def samples_of(run: Run) -> Sample:
-    """The run's motion every `PERIOD`, without instants of which nothing is known.
+    """The run's motion every `PERIOD`, without instants at which it is unknown.
 
-    Velocities are those of `truth.csv`, or derived from its poses. Of touches of walls a real log
-    does not tell. Raises `InputError` where the run has no poses.
+    Velocities are those of `truth.csv`, or derived from its poses. Wall contacts are always 0, as a
+    log does not record them. Raises `InputError` if the run has no poses.
     """
     if run.truth is None or not len(run.truth):
         raise InputError(f"{run.path}: has no truth.csv, so nothing tells where the car was")
@@ -46,7 +46,7 @@ def samples_of(run: Run) -> Sample:
 
 
 def judge_run(run: Run, course: Course | None, laps: int = 1) -> tuple[Score, dict[str, Any]]:
-    """The score of a run on a course, and the JSON of it as `drive` prints it."""
+    """The score of a run on a course, and its JSON as `drive` prints it."""
     task = dataclasses.replace(Task.of(course, laps), of_log=True)
     score, _ = task.follow(task.init(), samples_of(run))
     outcome = Outcome.of(score.outcome)

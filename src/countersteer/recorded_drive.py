@@ -37,8 +37,8 @@ class Drive(NamedTuple):
     simulator: Simulator
     pilot: Pilot
     course: Course | None
-    about: dict[str, Any]  # of `run.toml`
-    longest: float  # s
+    about: dict[str, Any]  # content of `run.toml`
+    longest: float  # s, time limit
 
 
 def prepare(
@@ -58,10 +58,10 @@ def prepare(
     floor: Floor | None = None,
     faults: tuple[SensorFault, ...] = (),
 ) -> Drive:
-    """A drive of a car round a course, by a driver's name or file, who knows the car `car_name`.
+    """A drive of a car on a course, by a driver's name or file.
 
-    `speed` (m/s) is what the driver is asked to bring to a turn, `charge` the battery's, 0 to 1.
-    Raises `InputError` where one of them is not what it should be.
+    The driver knows the car `car_name`. `speed` (m/s) is what it should bring to a turn, `charge`
+    is the battery's, 0 to 1. Raises `InputError` for a wrong argument.
     """
     course.check_laps(laps)
     nominal = load_car(car_name)
@@ -80,7 +80,7 @@ def prepare(
     )
     name = Path(driver).stem if driver.endswith((".csv", ".toml")) else driver
     about = about_run(simulator, pilot, course, name, car_name, laps, nominal, tables)
-    # A lap at a crawl still ends.
+    # The time limit is enough for a crawl of 0.3 m/s.
     return Drive(simulator, pilot, course, about, 20.0 + (course.lap_end(laps) or 0.0) / 0.3)
 
 
@@ -94,10 +94,10 @@ def about_run(
     nominal: Car,
     pilot_tables: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What `run.toml` says: enough to drive it again, and to run the pilot without a simulator.
+    """Content of `run.toml`: enough to drive it again, and to run the pilot without a simulator.
 
-    `nominal` is the car that the pilot knows; `pilot_tables` say what drives it, as
-    `drivers.library.make_driver` gives them.
+    `nominal` is the car that the pilot knows. `pilot_tables` describe the driver, as returned by
+    `drivers.registry.make_driver`.
     """
     link, dt = simulator.link, simulator.dt
     pace, sensors = pace_of(simulator), simulator.every._asdict()
@@ -150,21 +150,21 @@ def about_run(
 
 
 def pace_of(simulator: Simulator) -> Pace:
-    """How often what of a drive is recorded."""
+    """The recording periods of a drive."""
     ticks = simulator.link.in_ticks(simulator.dt)
     truth = max(1, round(PERIOD / simulator.dt))
     return Pace(simulator.dt, ticks.telemetry, truth, ticks.onboard)
 
 
 class Interrupt:
-    """Notes a Ctrl-C once a drive is under way, so that it ends between two pieces.
+    """Notes a Ctrl-C during a drive, so that the drive ends between two pieces.
 
-    An exception could come anywhere, also where some library swallows it. Before the first piece,
-    and from the second Ctrl-C on, it does what it did before.
+    An exception could come anywhere, even where a library swallows it. Before the first piece, and
+    from the second Ctrl-C on, Ctrl-C acts as it did before.
     """
 
     def __init__(self) -> None:
-        """Nothing was asked yet."""
+        """Before any Ctrl-C."""
         self.asked = False
         self._before: Any = None
 
@@ -172,7 +172,7 @@ class Interrupt:
         return self
 
     def begin(self) -> None:
-        """Notes Ctrl-C from now on (in the main thread; no other gets any)."""
+        """Note Ctrl-C from now on, in the main thread; no other thread receives it."""
         if self._before is None and threading.current_thread() is threading.main_thread():
             self._before = signal.signal(signal.SIGINT, self._note)
 
@@ -190,10 +190,10 @@ class Interrupt:
 def drive(
     what: Drive, folder: Path, report: Callable[[float, float], None] = lambda *_: None
 ) -> dict[str, Any]:
-    """Drives to the goal, or for the longest time, and writes the run's folder but its pictures.
+    """Drive to the goal or to the time limit, and write the run's folder without its pictures.
 
-    Returns the summary. `report` is told the progress (m or s). On an interrupt the files are
-    ended, and the drive counts as interrupted.
+    Returns the summary. `report` receives the progress and its end (m or s). On an interrupt the
+    files are completed, and the drive counts as interrupted.
     """
     simulator, pilot, course, about, longest = what
     laps = int(about["laps"])
@@ -229,7 +229,7 @@ def drive(
 
 
 def warm_up(what: Drive) -> None:
-    """Compiles the judge of the drive: beside the loop's compilation, which takes all the time."""
+    """Compile the judge of the drive. Call it while the loop compiles, which takes longer."""
     pace, task = pace_of(what.simulator), Task.of(what.course, int(what.about["laps"]))
     control = what.pilot.control
     ticks = max(1, round(PIECE / what.simulator.dt / control)) * control
@@ -240,13 +240,13 @@ def warm_up(what: Drive) -> None:
 
 
 def samples(simulator: Simulator, record: Record, rows: np.ndarray) -> Sample:
-    """What the judge looks at of some rows of a record."""
+    """The judge's samples of some rows of a record."""
     own = jax.tree.map(lambda leaf: leaf[rows], (record.motion, *record[6:8], record.status.turn))
     return Sample(record.tick[rows] * simulator.dt, *own)
 
 
 def frames(record: Record, end: int) -> Frames:
-    """What is recorded of the first rows of a record."""
+    """The frames of the first `end` rows of a record, for the recorder."""
     truth = truth_columns(record.motion, record.voltage)
     whole = Frames(record.tick, record.readings, record.command, record.fresh, truth)
     cut: Frames = jax.tree.map(lambda leaf: leaf[:end], whole)

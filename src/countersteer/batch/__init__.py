@@ -1,1 +1,1 @@
-"""Many cars at once: the engine, what varies, how many get round."""
+"""Many cars at once: the engine, their random variation, and their success."""

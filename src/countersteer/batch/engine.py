@@ -1,10 +1,12 @@
 """The engine of a batch: many lanes on all cores of a CPU, at the speed of its vector units.
 
-A batch is cut into blocks of lanes, and each core works through its share. There are two loops over
-blocks. `in_turn` is outside the compiled program: it is for drives that take seconds, and reports
-progress. `in_one_program` is inside: XLA runs a scan as one small kernel after another, and passes
-the whole batch's numbers through memory between them. A block's numbers stay in the core's caches.
-It needs the flags of `flags` before JAX starts; without them it is as right, and a tenth as fast.
+A batch is cut into blocks of lanes. Each core works through its share. There are two loops over
+blocks:
+
+- `in_turn` is outside the compiled program. It is for drives of seconds, and reports progress.
+- `in_one_program` is inside. XLA runs a scan as one small kernel after another. Between kernels,
+  the numbers of a whole batch pass through memory. Those of a block stay in the core's caches. It
+  needs the flags of `flags` before JAX starts. Without them it is correct, at a tenth of the speed.
 """
 
 import math
@@ -18,13 +20,13 @@ from jax.sharding import Mesh, PartitionSpec
 
 from countersteer.compiling import compiler_flags
 
-LANES = 128  # of a block in turn
-CACHED_LANES = 256  # of a block in one program: enough for the loop's overhead, few for the caches
+LANES = 128  # of a block of `in_turn`
+CACHED_LANES = 256  # of a block of `in_one_program`: many for the loop's overhead, few for caches
 
 
 def flags(cores: int) -> str:
-    """What XLA_FLAGS must be before JAX starts."""
-    # LLVM vectorises kernels with many results too, however long it must check for overlaps.
+    """The value of XLA_FLAGS. It must be set before JAX starts."""
+    # So LLVM vectorises kernels with many results too, although its checks for overlaps are long.
     backend = (
         "-runtime-memory-check-threshold=1000000",
         "-vectorize-memory-check-threshold=1000000",
@@ -34,14 +36,15 @@ def flags(cores: int) -> str:
 
 
 def all_cores(cores: int | None = None) -> Mesh:
-    """So many of JAX's devices (all)."""
+    """A mesh of the first `cores` of JAX's devices, by default of all."""
     return Mesh(np.array(jax.devices()[:cores]), ("core",))
 
 
 def on_cores(run: Callable[..., Any], mesh: Mesh, lanes: Sequence[bool]) -> Callable[..., Any]:
-    """`run` on each core, with its share of those arguments that have an axis of lanes in front.
+    """`run` on each core, with the core's share of the arguments.
 
-    Results have such an axis too.
+    `lanes` is True for arguments with a leading axis of lanes. The others are the same on each
+    core. Results have a leading axis of lanes.
     """
     cut, same = PartitionSpec("core"), PartitionSpec()
     specs = tuple(cut if has else same for has in lanes)
@@ -59,9 +62,9 @@ def in_turn(
 ) -> Any:
     """The results of `run` for blocks of `width` lanes, one block after another.
 
-    Leaves of `own` and of the results have an axis of lanes in front. The last block is filled up
-    with lanes from the start, whose results are dropped. `run` may tell the part of its block that
-    is done (0 to 1).
+    Leaves of `own` and of the results have a leading axis of lanes. The last block is filled up
+    with lanes from the start, whose results are dropped. `run` may report the finished part of its
+    block (0 to 1).
     """
     count = len(jax.tree.leaves(own)[0])
     found = []
@@ -80,15 +83,15 @@ def in_turn(
 def in_one_program(
     run: Callable[..., Any], lanes: int = CACHED_LANES, cores: int | None = None
 ) -> Callable[..., Any]:
-    """`run(own, *shared)` for a batch, compiled: the loop over blocks is in the program.
+    """`run(own, *shared)` for a batch, compiled with the loop over blocks inside the program.
 
-    `own` and the result have an axis of lanes in front, in `run` that of one block. The number of
-    lanes is a multiple of `lanes` times cores (`whole_blocks`).
+    `own` and the result have a leading axis of lanes. Within `run`, it has the lanes of one block.
+    The number of lanes must be a multiple of `lanes` times cores (`whole_blocks`).
     """
     mesh = all_cores(cores)
 
     def on_core(own: Any, *shared: Any) -> Any:
-        # A block's numbers are one array: that goes in and out of the loop in place.
+        # A block's numbers are one array, so that the loop updates it in place.
         numbers, unpack = _packed(own)
         shapes = jax.eval_shape(run, jax.tree.map(lambda leaf: leaf[:lanes], own), *shared)
         empty = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
@@ -107,11 +110,11 @@ def in_one_program(
 
 
 def _packed(trees: Any) -> tuple[Any, Callable[[Any], Any]]:
-    """(lanes, numbers of one) for a pytree of lanes, and back for one."""
+    """A pytree of lanes as an array (lanes, numbers of one), and the inverse for one lane."""
     _, unpack = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], trees))
     return jax.vmap(lambda tree: ravel_pytree(tree)[0])(trees), unpack
 
 
 def whole_blocks(count: int, lanes: int, cores: int) -> int:
-    """The least number of lanes that holds `count` and fills whole blocks."""
+    """The least number of lanes, at least `count`, that fills whole blocks on all cores."""
     return math.ceil(count / (lanes * cores)) * lanes * cores

@@ -1,4 +1,4 @@
-"""Drivers judged over randomised cars: success, errors and times with their intervals."""
+"""Evaluation of drivers over random cars: success with its interval, errors and times."""
 
 import dataclasses
 import math
@@ -24,26 +24,26 @@ DRIFT = math.radians(25)  # sideslip that makes a turn a drift
 CONFIDENCE = 0.95
 
 
-SLOWEST = 0.5  # m/s: a trial that takes longer is out of time
+SLOWEST = 0.5  # m/s; the time limit of a trial is 3 s, and that of its course at this speed
 
 
 @dataclasses.dataclass(frozen=True)
 class Trials:
-    """What all drivers of an evaluation have in common."""
+    """The settings that all drivers of an evaluation share."""
 
     course: Course
-    car: Car  # the one around which cars are drawn
-    nominal: Car  # the one that drivers and filters know
+    car: Car  # around which cars are drawn
+    nominal: Car  # known to drivers and filters
     population: Population
     seeds: Sequence[int]
-    speeds: tuple[float, float] | None  # asked for; None: the driver's own
+    speeds: tuple[float, float] | None  # m/s, range asked of the driver; None: its own speed
     laps: int
     link: Link
     estimate: str
     dt: float
 
     def __post_init__(self) -> None:
-        """Raises `InputError` where no drive of the course could succeed."""
+        """Raises `InputError` if no drive of the course can succeed."""
         self.course.check_laps(self.laps)
         if self.course.goal_distance is None:
             raise InputError(f"{self.course.name}: has no goal, so nothing tells a success")
@@ -53,7 +53,7 @@ class Trials:
         make: Callable[[float | None], Driver],
         report: Callable[[int, int], None] = lambda *_: None,
     ) -> Score:
-        """All trials of one driver, in 32 bits; `make` makes it for a speed."""
+        """The scores of one driver in all trials, in 32 bits. `make` makes it for a speed."""
         return self.run_watched(make, None, report)[0]
 
     def run_watched(
@@ -64,7 +64,7 @@ class Trials:
         faults: tuple[SensorFault, ...] = (),
         lanes: int = LANES,
     ) -> tuple[Score, Any]:
-        """The same with what `watch` has kept, and with sensors that fail as each trial's do."""
+        """The scores, as `run`, and the result of `watch`. `faults` holds times for each trial."""
         drawn = draw(self.population, self.car, self.course, self.seeds, np.float32, self.speeds)
         if drawn.speed is None:
             drivers = [make(None)] * len(self.seeds)
@@ -89,7 +89,7 @@ class Trials:
         )
 
     def about(self) -> dict[str, Any]:
-        """What a record says of the trials."""
+        """The settings of the trials for a record, by the names of the JSON."""
         return {
             "course": self.course.name,
             "cars": self.population.name,
@@ -103,16 +103,16 @@ class Trials:
 
 
 def interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's interval of a share."""
+    """Wilson's interval of a success rate."""
     found = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
     return float(found.low), float(found.high)
 
 
 def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
-    """What came of a driver's trials; names and units are those of the JSON."""
+    """Statistics of a driver's trials; names and units are those of the JSON."""
     won, turns = score.outcome == Outcome.REACHED.code, score.turns
     count, trials = int(np.sum(won)), len(seeds)
-    begun = np.isfinite(turns.begin)  # a bend may be rounded without a turn of its own
+    begun = np.isfinite(turns.begin)  # a corner may be passed without a turn of its own
     drifts = np.all((turns.peak_sideslip > DRIFT) | ~begun, axis=1)
     counted = begun & won[:, None]
     errors = np.degrees(turns.error[counted])
@@ -141,7 +141,7 @@ def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
 
 
 def overshoot(degrees: np.ndarray) -> dict[str, float | None]:
-    """How far the heading goes beyond the corridor behind a turn: the median, and the 95 %."""
+    """Median and 95th percentile of the heading's overshoot over the corridor behind a turn."""
     found = {"median": 50, "p95": 95}
     return {
         f"heading_overshoot_deg_{name}": float(np.percentile(degrees, part))

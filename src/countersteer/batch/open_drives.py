@@ -1,8 +1,8 @@
-"""Many short drives at once, sampled as they go: what trials and experiments look at.
+"""Many short open drives at once, sampled on the way, for trials and experiments.
 
-Each lane has its own car, charge, velocity at the start and driver's numbers. There is no sensor
-and no link, and nothing is judged: the driver is called at each tick, and told the time and the
-true motion. Without walls it is open floor.
+Each lane has its own car, charge, initial velocity and driver parameters. There are no sensors, no
+link and no judge. The driver is called at each tick with the time and the true motion. Without
+walls, the floor is open.
 """
 
 import math
@@ -28,14 +28,14 @@ from countersteer.world.floor import Floor
 from countersteer.world.state import State
 from countersteer.world.walls import padded
 
-PIECE = 100  # samples of a call, whatever the length of the drives
+PIECE = 100  # samples in each call, for any length of the drives
 DT = 0.001  # s
 STEPS = 4
 NOTHING = Heard(math.nan, math.inf)
 
 
 class OpenDrive(NamedTuple):
-    """What a drive has of its own; in a batch, leaves have an axis of drives in front."""
+    """A drive's own part; in a batch, leaves have a leading axis of drives."""
 
     car: Car
     driver: Any
@@ -46,7 +46,7 @@ class OpenDrive(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """What came of the drives: arrays of (drives, samples)."""
+    """The samples of the drives: arrays of (drives, samples)."""
 
     time: np.ndarray  # (samples,), s
     motion: Motion
@@ -68,9 +68,9 @@ def drives(
 ) -> Sampled:
     """One drive of `longest` seconds for each driver, sampled each `PERIOD` seconds.
 
-    `velocity` (drives, 3) is vx, vy and yaw rate at the start, at which the wheels roll, and `pose`
-    (drives, 3) x, y and heading; `walls` are (n, 4), for all. Leaves of `cars` and `floor` have an
-    axis of drives in front; the precision is that of `charge`.
+    `velocity` (drives, 3) is vx, vy and yaw rate at the start, where the wheels roll. `pose`
+    (drives, 3) is x, y and heading. `walls` (n, 4) are the same for all. Leaves of `cars` and
+    `floor` have a leading axis of drives. The precision is that of `charge`.
     """
     dtype = np.asarray(charge).dtype
     driver = jax.tree.map(lambda *leaves: np.stack(leaves).astype(dtype), *drivers)
@@ -99,7 +99,7 @@ def drives(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _start(mesh: Mesh, slots: int, block: Any) -> Any:
-    """State and driver's memory before the first tick."""
+    """The states and the drivers' memories before the first tick."""
 
     def one(own: OpenDrive) -> Any:
         v, at = own.velocity, own.pose
@@ -116,7 +116,7 @@ def _start(mesh: Mesh, slots: int, block: Any) -> Any:
 
 @partial(jax.jit, static_argnums=0)
 def _piece(mesh: Mesh, block: Any, loop: Any, walls: Any, tick: Any) -> Any:
-    """The next `PIECE` samples: the motion at each, and the command that is asked for then."""
+    """The next `PIECE` samples: the motion and the command at each."""
     every = round(PERIOD / DT)
 
     def one(own: OpenDrive, loop: Any, walls: Any) -> Any:
@@ -141,7 +141,7 @@ def _piece(mesh: Mesh, block: Any, loop: Any, walls: Any, tick: Any) -> Any:
 
 
 def observed(state: State, count: Any) -> Observation:
-    """What a driver is told here."""
+    """The observation of a driver: the time and the true motion."""
     m = state.motion
     known = Estimate(m.x, m.y, m.heading, m.vx, m.vy, m.yaw_rate)
     time = DT * count.astype(m.x.dtype)
@@ -150,13 +150,13 @@ def observed(state: State, count: Any) -> Observation:
 
 
 def commands(*steps: tuple[float, float, float]) -> Replay:
-    """Open-loop commands of up to `STEPS` steps: time, throttle, steering (rad)."""
-    # As many for all, so that they share a program.
+    """A driver with up to `STEPS` open-loop steps of time (s), throttle and steering (rad)."""
+    # The same number for all, so that they share a program.
     padded = np.array([*steps, *[steps[-1]] * (STEPS - len(steps))]).T
     return Replay(times=padded[0], throttle=padded[1], steering=padded[2])
 
 
 def repeated(car: Car, count: int) -> Car:
-    """So many of one car, in 32 bits."""
+    """`count` copies of one car, in 32 bits."""
     many: Car = jax.tree.map(lambda leaf: np.broadcast_to(np.float32(leaf), (count,)), car)
     return many

@@ -1,4 +1,4 @@
-"""Cars drawn around a nominal one: a set is a file, and a trial is its seed."""
+"""Random cars around a nominal one. A set of cars is a file, and a seed gives a trial."""
 
 import dataclasses
 import importlib.resources
@@ -26,12 +26,12 @@ START = {"along_m": 1.0, "offset_m": 1.0, "heading_deg": math.pi / 180}  # facto
 
 
 class Varied(NamedTuple):
-    """Parameters that one draw u in [-1, 1] sets, in the units used inside.
+    """Parameters that one random u in [-1, 1] sets, in the units used inside.
 
-    value · (1 + within u) + plus u, or from one of `ends` to the other.
+    Their value is nominal · (1 + within u) + plus u, or goes from one of `ends` to the other.
     """
 
-    paths: tuple[str, ...]  # of names inside
+    paths: tuple[str, ...]  # by the names used inside
     declared: tuple[Declaration, ...]
     within: float
     plus: float
@@ -40,27 +40,27 @@ class Varied(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Population:
-    """What trials draw from. SI units and radians."""
+    """The distribution of trials. SI units and radians."""
 
     name: str
     varied: tuple[Varied, ...]
     charge: tuple[float, float]
-    start: tuple[float, float, float]  # most along the line, to its left, and turned
-    floor: tuple[float, float]  # standard deviation of the friction, relative, and its length (m)
+    start: tuple[float, float, float]  # largest offset along the line, to its left, and in heading
+    floor: tuple[float, float]  # friction: relative standard deviation, and length scale (m)
 
 
 class Drawn(NamedTuple):
-    """A batch of trials; the leaves of `cars` have an axis in front."""
+    """A batch of trials; the leaves of `cars` have a leading axis of trials."""
 
     cars: Car
     charge: Array
     pose: Array  # (n, 3) x, y, heading
-    speed: Array | None  # that the driver is asked to bring to a turn
+    speed: Array | None  # m/s, asked of the driver at a turn
     floor: Floor | None
 
 
 def load_population(name: str) -> Population:
-    """A set from the library or a file. Raises `InputError` naming file and key."""
+    """Load a set from the library or a file. Raises `InputError` with file and key."""
     tables, where = read_toml(name, LIBRARY, "set of cars")
     for key in tables:
         if key not in ("description", "vary", "start", "floor"):
@@ -120,7 +120,7 @@ def _varied(where: str, key: str, entry: Any) -> Varied:
 
 
 def locate(where: str, path: str) -> tuple[str, Declaration, float]:
-    """Of a parameter named as files do: its dotted path inside, declaration, and unit's factor."""
+    """The path inside, declaration and unit factor of a parameter, by its name in files."""
     from countersteer.car.parameter import EDGE
 
     part: Any = Car()
@@ -144,7 +144,7 @@ def draw(
     dtype: Any,
     speeds: tuple[float, float] | None = None,
 ) -> Drawn:
-    """One car, charge, start and speed to ask for, for each seed, around a nominal car."""
+    """Draw a car, charge, start, speed and floor for each seed, around a nominal car."""
     count = len(population.varied) + 5
     even = np.array([np.random.default_rng(seed).uniform(-1, 1, count) for seed in seeds])
     for number, entry in enumerate(population.varied):
@@ -175,11 +175,11 @@ def draw(
 
 
 def _floors(population: Population, seeds: Sequence[int], dtype: Any) -> Floor | None:
-    """A floor for each seed; None where it is the same everywhere."""
+    """A floor for each seed; None if friction is the same everywhere."""
     deviation, length = population.floor
     if deviation == 0:
         return None
-    with jax.enable_x64(False):  # else other numbers are drawn
+    with jax.enable_x64(False):  # 64 bits would draw other numbers
 
         @jax.jit
         @jax.vmap
@@ -193,7 +193,7 @@ def _floors(population: Population, seeds: Sequence[int], dtype: Any) -> Floor |
 
 
 def _between(ends: tuple[float, float], even: Array) -> Array:
-    """From one end to the other as `even` goes from -1 to 1."""
+    """Map `even` linearly from [-1, 1] to the two ends."""
     return ends[0] + (ends[1] - ends[0]) * (even + 1) / 2
 
 

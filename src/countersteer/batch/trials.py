@@ -1,8 +1,8 @@
-"""Many closed-loop drives at once, judged as they go.
+"""Many closed-loop drives at once, judged on the way.
 
-Each lane is a trial with its own car, start, noise and driver's numbers. A trial ends when its goal
-is reached and its last turn has ended, or when it can no longer succeed. A block goes on until all
-its trials have ended.
+Each lane is a trial with its own car, start, noise and driver parameters. A trial ends when its
+goal is reached and its last turn has ended, or when it can no longer succeed. A block runs until
+all its trials have ended.
 """
 
 import dataclasses
@@ -31,14 +31,14 @@ from countersteer.task.judge import PERIOD, Outcome, Sample, Score, Task
 from countersteer.world import planar
 from countersteer.world.floor import Floor
 
-FEW = 16  # trials of a block where there are no more
+FEW = 16  # trials in a core's block, if one such block on each core holds them all
 
 
 class Trial(NamedTuple):
-    """What a trial has of its own; in a batch, leaves have an axis of trials in front."""
+    """A trial's own part; in a batch, leaves have a leading axis of trials."""
 
     car: Car
-    driver: Any  # leaves that all trials share have no such axis
+    driver: Any  # in a batch, None for leaves that all trials share
     charge: Array
     pose: Array  # (n, 3)
     floor: Floor | None
@@ -47,12 +47,12 @@ class Trial(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """What all trials share."""
+    """The part that all trials share."""
 
-    simulator: Simulator  # the one whose parts the trials' own take the place of
-    pilot: Pilot  # the same, of its driver
+    simulator: Simulator  # without the parts that each trial has of its own
+    pilot: Pilot  # without its driver
     task: Task
-    ticks: Scalar  # at most
+    ticks: Scalar  # largest number of ticks
     watch: Any = None
 
 
@@ -67,14 +67,14 @@ class Instant(NamedTuple):
 
 
 class Watch(Protocol):
-    """What looks on beside the judge, every `PERIOD`: a pytree that all trials share."""
+    """An observer beside the judge, called every `PERIOD`: a pytree that all trials share."""
 
     def begin(self, now: Instant) -> Any:
-        """What is kept before the first tick; a pytree."""
+        """The record before the first tick: a pytree."""
         ...
 
     def look(self, now: Instant, kept: Any) -> Any:
-        """What is kept with this instant. It has no effect once the trial is over."""
+        """The record with this instant added. It has no effect once the trial is over."""
         ...
 
     def end(self, kept: Any) -> Any:
@@ -84,7 +84,7 @@ class Watch(Protocol):
 
 @partial(jax.jit, static_argnums=0)
 def _block(mesh: Mesh, own: Trial, driver: Any, shared: Shared) -> tuple[Score, Any]:
-    """A block of trials on each core; `driver` holds None where the trials' drivers differ."""
+    """Run a block of trials on each core. `driver` holds None where the trials' drivers differ."""
 
     def on_core(own: Trial, driver: Any, shared: Shared) -> tuple[Score, Any]:
         def one(own: Trial) -> tuple[Score, Any]:
@@ -101,7 +101,7 @@ def _block(mesh: Mesh, own: Trial, driver: Any, shared: Shared) -> tuple[Score, 
 
 
 def _trial(shared: Shared, own: Trial) -> tuple[Score, Any]:
-    """One trial of a block."""
+    """Run one trial of a block."""
     task, watch = shared.task, shared.watch
     world: Any = shared.simulator.world
     simulator = dataclasses.replace(
@@ -135,7 +135,7 @@ def _trial(shared: Shared, own: Trial) -> tuple[Score, Any]:
         turn = jnp.asarray(pilot.status(memory).turn)
         score = task.update(score, Sample(time, motion, *events, turn))
         (loop, memory), _ = jax.lax.scan(one, (loop, memory), None, length=every)
-        # Common to the block, so that the loop's end is.
+        # Common to the block, so that all its trials leave the loop together.
         going = jax.lax.pmax((score.outcome == Outcome.DRIVING.code).astype(jnp.int32), "trial")
         return loop, memory, score, going, kept
 
@@ -164,11 +164,11 @@ def run_trials(
     faults: tuple[SensorFault, ...] = (),
     link: Link = ONBOARD,
 ) -> tuple[Score, Any]:
-    """One trial for each seed: its score, and what `watch` has kept (`()` without one).
+    """Run one trial for each seed: its score, and the result of `watch` (`()` without one).
 
-    Each seed has its row in `drawn` and its driver in `drivers`, which takes the place of the
-    pilot's own. The precision is that of the leaves of `drawn`. Leaves of `faults` and of the
-    result have an axis of trials in front. Raises `InputError` if the course has no goal.
+    Each seed has its row in `drawn`, and its driver in `drivers`, which replaces the pilot's own.
+    The precision is that of the leaves of `drawn`. Leaves of `faults` and of the result have a
+    leading axis of trials. Raises `InputError` if the course has no goal.
     """
     if course.goal_distance is None:
         raise InputError("trials need a course with a goal")
@@ -214,12 +214,12 @@ def run_trials(
 
 
 def _without(tree: Any, *names: str) -> Any:
-    """The tree without parts that each trial has of its own."""
+    """The tree with None for the parts that each trial has of its own."""
     return dataclasses.replace(tree, **dict.fromkeys(names))
 
 
 def _common(drivers: Sequence[Driver], dtype: Any) -> tuple[Any, Any]:
-    """Leaves that all drivers share, and stacked those that differ; None where it is the other."""
+    """Two trees: the leaves that all drivers share, and the others, stacked; elsewhere None."""
     flat = [jax.tree.flatten(driver) for driver in drivers]
     treedef = flat[0][1]
     common, own = [], []

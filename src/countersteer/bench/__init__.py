@@ -1,1 +1,1 @@
-"""How fast it is, beside what it is compared to."""
+"""The speed of the simulator, beside that of MuJoCo."""

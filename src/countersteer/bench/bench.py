@@ -1,7 +1,7 @@
-"""`bench`: how fast it is, beside what it is compared to, measured in one run.
+"""`bench`: the speed of the simulator beside that of MuJoCo, measured in one run.
 
-Each side is a process of its own, as the compiler's flags are a process's. All are made ready
-first; then they take turns, round after round, so that what else the machine does hits all alike.
+Each side is a process of its own, because compiler flags hold for a whole process. All sides are
+prepared first. Then they take turns, round after round, so that other load affects all equally.
 """
 
 import contextlib
@@ -28,10 +28,10 @@ Figures = dict[str, float]
 
 
 class Size(NamedTuple):
-    """How much is measured."""
+    """The amount of measurement."""
 
     rounds: int = 7
-    least: float = 0.3  # s that a measurement takes
+    least: float = 0.3  # s, shortest measurement
     cars: int = 32768
     ticks: int = 100
     warms: int = 3  # drives in a process of their own, after one with an empty cache
@@ -42,12 +42,12 @@ QUICK = Size(rounds=3, least=0.1, warms=1)
 
 
 def cores() -> int:
-    """How many the process may use."""
+    """The number of cores that the process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def rate(work: float, run: Callable[[], Any], least: float) -> float:
-    """Work per second of calls that go on for at least so long."""
+    """Work per second, with calls repeated for at least `least` (s)."""
     begin, calls = time.perf_counter(), 0
     while (spent := time.perf_counter() - begin) < least or calls == 0:
         run()
@@ -55,7 +55,7 @@ def rate(work: float, run: Callable[[], Any], least: float) -> float:
     return calls * work / spent
 
 
-# Sides. Each prepares, yields what it found out once, then a round of figures each time.
+# Sides. Each prepares, yields its facts once, and then the figures of one round each time.
 
 
 def planar_side(size: Size) -> Iterator[dict[str, Any]]:
@@ -72,7 +72,7 @@ def planar_side(size: Size) -> Iterator[dict[str, Any]]:
 
 
 def mujoco_side(size: Size) -> Iterator[dict[str, Any]]:
-    """A like car in MuJoCo, on all cores and on one."""
+    """A similar car in MuJoCo, on all cores and on one."""
     from countersteer.bench.mujoco_car import batch, model
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
@@ -116,7 +116,7 @@ def drive_side(size: Size) -> Iterator[dict[str, Any]]:
 
 
 def thinking(simulator: Any, pilot: Any) -> tuple[Any, Any, Any]:
-    """A driver's `act`, compiled, with a memory and an observation at which it thinks."""
+    """A driver's compiled `act`, with a memory and an observation for it."""
     import jax
     import jax.numpy as jnp
 
@@ -136,7 +136,7 @@ SIDES: dict[str, Callable[[Size], Iterator[dict[str, Any]]]] = {
 
 
 def serve(module: str, side: str, size: Size) -> None:
-    """A side's process: a line of JSON when ready, and one for each line that it is sent.
+    """The process of a side: print a line of JSON when ready, and one for each line of input.
 
     `module` has the side in its `SIDES`.
     """
@@ -154,10 +154,10 @@ def serve(module: str, side: str, size: Size) -> None:
 
 
 class Side:
-    """The other end of `serve`."""
+    """A side's process, seen from the bench: the other end of `serve`."""
 
     def __init__(self, module: str, name: str, size: Size):
-        """Starts the process."""
+        """Start the process."""
         self.name = name
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # as long as the process
         order = f"from countersteer.bench.bench import *; serve({module!r}, {name!r}, {size!r})"
@@ -172,7 +172,7 @@ class Side:
         )
 
     def answer(self) -> dict[str, Any]:
-        """What it says next. Raises `RuntimeError` with its last words if it ended."""
+        """Its next line. Raises `RuntimeError` with its last line of error if it ended."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
@@ -183,28 +183,28 @@ class Side:
         return found
 
     def round(self) -> Figures:
-        """One more round."""
+        """The figures of one more round."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
         return self.answer()
 
     def close(self) -> None:
-        """Ends the process."""
+        """End the process."""
         self._process.kill()
         self._process.communicate()
         self._errors.close()
 
 
 def missing_sides() -> dict[str, str]:
-    """Those that cannot be run here, and why."""
+    """The sides that cannot run here, with the reason."""
     if importlib.util.find_spec("mujoco") is None:
         return {"mujoco": "MuJoCo is not installed: pip install mujoco"}
     return {}
 
 
 class Measured(NamedTuple):
-    """What a bench found: samples and facts of its sides, sides skipped and why, load, time (s)."""
+    """A bench's result: samples, facts, skipped sides with reasons, load, and duration (s)."""
 
     samples: dict[str, list[float]]
     facts: dict[str, Any]
@@ -220,7 +220,7 @@ def measure(
     sides: Sequence[str],
     skipped: dict[str, str],
 ) -> Measured:
-    """The sides that are in `module`, but those skipped; `show` is told how far it has come."""
+    """Measure the sides of `module`, except those skipped. `show` receives the progress."""
     skipped = dict(skipped)
     begin, load = time.time(), os.getloadavg()[0]
     steps = float(len(sides) + size.rounds + size.warms + 3)
@@ -312,7 +312,7 @@ def result(measured: Measured) -> dict[str, Any]:
 
 
 def machine(load: tuple[float, float]) -> dict[str, Any]:
-    """Where it was measured."""
+    """The machine of the measurement, with its load and versions."""
     info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     name = re.search(r"model name\s*: (.+)", info)
     wide = [isa for isa in ("avx512f", "avx2", "asimd") if re.search(rf"\b{isa}\b", info)]
@@ -333,7 +333,7 @@ def machine(load: tuple[float, float]) -> dict[str, Any]:
 
 
 def lines(found: dict[str, Any]) -> list[str]:
-    """What `bench` prints for a person."""
+    """The lines that `bench` prints for a person."""
 
     def millions(name: str) -> str:
         return f"{found[name] / 1e6:.2f} M" if found.get(name) else "-"

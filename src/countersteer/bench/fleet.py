@@ -1,4 +1,4 @@
-"""A batch of planar cars in random drives: what the bench steps."""
+"""A batch of planar cars in random drives, for the bench."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,8 +15,8 @@ from countersteer.world import planar
 from countersteer.world.state import State
 from countersteer.world.walls import padded
 
-# In a block each delay line has its slots first: each slot's lanes lie side by side.
-MOTION: Any = 0  # an axis stands for all of a motion
+# In a block, each delay line has its slots as the first axis. So the lanes of a slot are adjacent.
+MOTION: Any = 0  # one axis for all leaves of a motion
 AXES = State(MOTION, 1, 1, 0, 0, 0, 0, 0)
 
 
@@ -28,9 +28,9 @@ def advance(
     dt: float,
     ticks: int,
 ) -> State:
-    """A block's states after so many ticks, each lane with its own command; plain `vmap`.
+    """A block's states after `ticks` ticks, each lane with its own command; plain `vmap`.
 
-    `own` holds each lane's `Car`, state and command. Where the car is None, it is `same` for all.
+    `own` holds each lane's `Car`, state and command. If the car is None, all lanes have `same`.
     """
     car, states, commands = own
     axes = (None if car is None else 0, None, AXES, 0, None, None)
@@ -63,7 +63,7 @@ class Fleet:
         block: int | None = None,
         dt: float = 0.001,
     ):
-        """At least so many cars, in whole blocks on each core; `varied`: each another car."""
+        """At least `cars` cars, in whole blocks on each core. With `varied`, each car differs."""
         self.dt, self.varied = dt, varied
         self.cars = cars = whole_blocks(cars, block or CACHED_LANES, cores)
         rng = np.random.default_rng(0)
@@ -71,7 +71,7 @@ class Fleet:
         car = jax.tree.map(np.float32, car)
         start = planar.initial_state(car, dt, course.start)
         self.states = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], cars, 0), start)
-        # Anywhere on the corridor's first side, about along it.
+        # Anywhere on the corridor's first side, roughly along it.
         speed = rng.uniform(0.0, 3.0, cars).astype(np.float32)
         rolling = [speed / tire.radius for tire in planar.tires_by_wheel(car)]
         motion = self.states.motion._replace(
@@ -87,7 +87,7 @@ class Fleet:
             rng.uniform(-0.5, 0.5, cars).astype(np.float32),
         )
         self.walls = padded(course.walls, np.dtype(np.float32))
-        if varied:  # downwards: a differential that is locked must not get beyond it
+        if varied:  # only downwards: a locked differential is at its upper limit
             car = jax.tree.map(lambda p: (p * rng.uniform(0.95, 1.0, cars)).astype(np.float32), car)
         self.car = car
         self.states, self.commands, self.car = jax.tree.map(
@@ -95,7 +95,7 @@ class Fleet:
         )
 
     def compiled(self, program: Any) -> Any:
-        """The program for these inputs."""
+        """The program, compiled for these inputs."""
         return program.lower(*self.inputs()).compile()
 
     def inputs(self) -> tuple[Any, ...]:
@@ -105,10 +105,10 @@ class Fleet:
     def inputs_of(
         self, states: State, commands: Command, walls: Any, first: int
     ) -> tuple[Any, ...]:
-        """The same from other states, commands and walls, at a tick."""
+        """The arguments of `advance` with other states, commands and walls, from tick `first`."""
         own, same = (self.car, None) if self.varied else (None, self.car)
         return (own, states, commands), same, walls, np.int32(first)
 
     def call(self, program: Any) -> Callable[[], Any]:
-        """One run of it from the start."""
+        """A function that runs the program once, from the start."""
         return lambda: jax.block_until_ready(program(*self.inputs()))

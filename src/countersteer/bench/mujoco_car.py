@@ -1,4 +1,4 @@
-"""A car like ours in MuJoCo, for the bench: what the engine that others use would make of it."""
+"""A similar car in MuJoCo, for the bench: a comparison with a widely used engine."""
 
 from collections.abc import Callable
 
@@ -15,10 +15,10 @@ NAMES = ("fl", "fr", "rl", "rr")
 
 
 def model(car: Car, course: Course, dt: float) -> mujoco.MjModel:
-    """Chassis and four wheels without suspension: five bodies, twelve freedoms.
+    """Chassis and four wheels without suspension: five bodies, twelve degrees of freedom.
 
-    The front wheels are steered by position actuators, a motor turns each wheel. Only wheels and
-    floor, chassis and walls can touch. Ellipsoids (one contact a wheel) and the `implicitfast`
+    Position actuators steer the front wheels. A motor turns each wheel. Only wheels and floor, and
+    chassis and walls, can touch. Ellipsoid wheels (one contact each) and the `implicitfast`
     integrator with MuJoCo's default solver were the fastest of those tried.
     """
     body, front, rear = car.body, car.tires.front, car.tires.rear
@@ -73,7 +73,10 @@ def model(car: Car, course: Course, dt: float) -> mujoco.MjModel:
 def batch(
     compiled: mujoco.MjModel, cars: int, steps: int, threads: int
 ) -> Callable[[], np.ndarray]:
-    """A call drives so many cars so many steps, on so many threads; it returns where they end."""
+    """A function that drives `cars` cars for `steps` steps on `threads` threads.
+
+    It returns their end positions (m): (cars, 2).
+    """
     data = [mujoco.MjData(compiled) for _ in range(threads)]
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
     settled = np.zeros(mujoco.mj_stateSize(compiled, kind))

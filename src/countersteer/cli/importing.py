@@ -5,25 +5,23 @@ import json
 from pathlib import Path
 
 from countersteer.cli.options import DONE, Verbs
+from countersteer.runs.importers import FORMATS, importer
 
 
 def add(verbs: Verbs) -> None:
     """The verb with its options."""
     take = verbs.verb("import", "other people's logs to run folders", run)
-    take.add_argument("format", choices=("dart", "eth"), metavar="FORMAT", help="dart or eth")
+    kinds = "; ".join(": ".join(pair) for pair in FORMATS.items())
+    take.add_argument("format", choices=tuple(FORMATS), metavar="FORMAT", help=kinds)
     take.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a log")
     take.option("--out", "DIR", Path, None, "folder of the run folders", required=True)
 
 
 def run(options: argparse.Namespace) -> int:
     """`import`."""
-    from countersteer.runs.importers.dart import import_dart
-    from countersteer.runs.importers.eth import import_eth
-
-    importer = {"dart": import_dart, "eth": import_eth}[options.format]
-    results = []
+    to_run, results = importer(options.format), []
     for file in options.files:
-        results.append(importer(file, options.out))
+        results.append(to_run(file, options.out))
         if not options.json:
             print(f"{file.name} -> {options.out / file.stem}")
     if options.json:

@@ -10,10 +10,10 @@ import shapely
 from countersteer.course.course import Course, from_track, walls_around
 from countersteer.errors import InputError
 
-COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # in this order where there is no header
+COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # in this order without a header
 ALIASES = {"d_right": "w_tr_right_m", "d_left": "w_tr_left_m"}
-SAME = 1e-3  # m within which two points are one
-TOLERANCE = 0.01  # of the mean width: how far walls may be from the true edge of the corridor
+SAME = 1e-3  # m within which two points count as one
+TOLERANCE = 0.01  # of the mean width: largest distance of walls from the corridor's true edge
 MOST_POINTS = 20_000
 NARROWEST, WIDEST, FARTHEST = 0.05, 1e3, 1e5  # m
 
@@ -21,10 +21,10 @@ NARROWEST, WIDEST, FARTHEST = 0.05, 1e3, 1e5  # m
 def read_centre_line(path: Path) -> Course:
     """The closed course along a centre line, starting at its first point.
 
-    A row is a point with the room to the right and to the left of it, split by commas, semicolons
-    or blanks. A header, a comment or not, names the columns (`COLUMNS` in any order among others).
-    The corridor is what the cross-sections sweep, each from wall to wall; so no wall stands in it,
-    also where the inside of a bend is tighter than the room there. Its walls keep within
+    A row is a point with the room to its right and to its left, split by commas, semicolons or
+    blanks. A header, also in a comment, names the columns: `COLUMNS` in any order, among others.
+    The corridor is the area that its cross-sections sweep, each from wall to wall. So no wall
+    stands in it, even if a bend is tighter inside than the room there. The walls are within
     `TOLERANCE` of its true edge. Raises `InputError` naming file and line.
     """
     table = _rows(path)
@@ -41,7 +41,7 @@ def read_centre_line(path: Path) -> Course:
     following = [np.roll(side, -1, axis=0) for side in (left, right)]
     swept = shapely.convex_hull(shapely.linestrings(np.stack([right, left, *following], axis=1)))
     tolerance = TOLERANCE * float(np.mean(np.sum(sides, axis=1)))
-    # Slivers between pieces that nearly meet are no walls.
+    # Slivers between pieces that nearly touch are not walls.
     corridor: Any = shapely.union_all(swept)
     holes = [h for h in corridor.interiors if not shapely.Polygon(h).buffer(-tolerance).is_empty]
     if not holes:
@@ -51,7 +51,7 @@ def read_centre_line(path: Path) -> Course:
 
 
 def _rows(path: Path) -> np.ndarray:
-    """The numbers of the file, its columns as in `COLUMNS`."""
+    """The numbers of the file (n, 4), in the order of `COLUMNS`."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

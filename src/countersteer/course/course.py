@@ -12,7 +12,7 @@ from countersteer.errors import InputError
 if TYPE_CHECKING:
     from shapely import Polygon
 
-ARC_STEP = math.radians(5)  # of the chords that stand for a rounded corner
+ARC_STEP = math.radians(5)  # largest angle of a chord of a rounded corner
 MOST_WALLS = 8192
 
 
@@ -26,14 +26,13 @@ class Turn(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Course:
-    """Immutable; distances are along the centre line, in metres. Angles in rad."""
+    """An immutable course. Distances are along the centre line, in metres; angles in rad."""
 
     name: str
-    width: float | None  # the least one; None where there are only free walls
+    width: float | None  # the smallest; None: there are only free walls
     closed: bool
-    line: (
-        np.ndarray
-    )  # (n, 2) corner points of the centre line, the first again at the end if closed
+    # (n, 2) corner points of the centre line, the first again at the end if closed
+    line: np.ndarray
     walls: np.ndarray  # (m, 4) x, y of both ends
     turns: tuple[Turn, ...]
     start: tuple[float, float, float]  # x, y, heading
@@ -44,7 +43,7 @@ class Course:
 
     @property
     def length(self) -> float:
-        """Of the centre line."""
+        """Length of the centre line."""
         return float(self.marks[-1]) if len(self.line) else 0.0
 
     @property
@@ -54,13 +53,13 @@ class Course:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def lap_end(self, laps: int) -> float | None:
-        """Unwrapped distance at which a drive of so many laps is done."""
+        """Unwrapped distance of the goal after so many laps; None without a goal."""
         if self.goal_distance is None:
             return None
         return self.goal_distance + (laps - 1) * self.length if self.closed else self.goal_distance
 
     def check_laps(self, laps: int) -> None:
-        """Raises `InputError` where the course cannot be driven so many times."""
+        """Raise `InputError` if the course cannot be driven for so many laps."""
         if laps > 1 and not self.closed:
             raise InputError(f"--laps {laps}: {self.name} is open, and driven once")
 
@@ -84,9 +83,10 @@ def from_segments(
 ) -> Course:
     """A corridor. `segments` holds ("straight", length, 0) and ("turn", angle, radius).
 
-    Straights run between the corner points of the centre line; a radius rounds the corner, and a
-    radius of 0 mitres it. `start` is distance, offset to the left, heading against the line.
-    Raises `InputError` where the segments do not make a corridor.
+    Straights run between the corner points of the centre line. A radius rounds the corner, and a
+    radius of 0 mitres it. `start` is distance, offset to the left, heading relative to the line.
+    `goal` is a distance: by default that of the end, or a lap after the start if closed.
+    Raises `InputError` if the segments do not make a corridor.
     """
     corners, angles, radii = [np.zeros(2)], [0.0], [0.0]
     heading, turn, radius, fresh = 0.0, 0.0, 0.0, True
@@ -133,12 +133,12 @@ def from_segments(
 def from_walls(
     name: str, walls: np.ndarray, start: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> Course:
-    """Free walls; `start` is x, y, heading."""
+    """A course of free walls; `start` is x, y, heading."""
     return Course(name, None, False, np.zeros((0, 2)), walls, (), start, 0.0, None)
 
 
 def from_track(name: str, line: np.ndarray, sides: np.ndarray, walls: np.ndarray) -> Course:
-    """A closed course along any line, starting at its first point; the goal is a lap later.
+    """A closed course along any line. It starts at the first point; the goal is a lap later.
 
     `line` (n, 2) and `sides` (n, 2) go round once, without the first point again.
     """
@@ -160,9 +160,9 @@ def walls_around(area: "Polygon", where: str) -> np.ndarray:
 def _rounded(
     name: str, corners: np.ndarray, angles: list[float], radii: list[float], closed: bool
 ) -> tuple[np.ndarray, tuple[Turn, ...]]:
-    """Corner points with arcs put in, and the turns with their distances.
+    """The corner points with inserted arcs, and the turns with their distances.
 
-    A closed line starts and ends where the arc of its last turn, that of corner 0, ends.
+    Corner 0 is the last turn of a closed line. The line starts and ends at the end of its arc.
     """
     steps = np.diff(corners, axis=0)
     lengths, headings = np.hypot(*steps.T), np.arctan2(steps[:, 1], steps[:, 0])
@@ -188,7 +188,7 @@ def _rounded(
 
 
 def _arc(corner: np.ndarray, heading: float, angle: float, radius: float) -> np.ndarray:
-    """Points on the arc that rounds a corner entered at this heading; the corner if it has none."""
+    """Points on the arc of a corner that is entered at a heading; without an arc, the corner."""
     if radius == 0 or angle == 0:
         return corner[None]
     count = max(1, math.ceil(abs(angle) / ARC_STEP))
@@ -201,7 +201,7 @@ def _arc(corner: np.ndarray, heading: float, angle: float, radius: float) -> np.
 
 
 def _offset(points: np.ndarray, closed: bool, aside: float) -> np.ndarray:
-    """The polyline moved aside to the left, its corners mitred, as wall segments."""
+    """Wall segments (m, 4) of the polyline moved to the left by `aside`, with mitred corners."""
     steps = np.diff(points, axis=0)
     along = steps / np.hypot(*steps.T)[:, None]
     before = np.roll(along, 1, axis=0) if closed else np.vstack([along[:1], along[:-1]])
@@ -215,7 +215,7 @@ def _offset(points: np.ndarray, closed: bool, aside: float) -> np.ndarray:
 
 
 def place(course: Course, distance: float) -> tuple[float, float, float]:
-    """x, y and heading of the centre line at a distance (wrapped where the course is closed)."""
+    """x, y and heading of the centre line at a distance (wrapped on a closed course)."""
     marks = course.marks
     if course.closed:
         distance = distance % course.length
@@ -226,10 +226,10 @@ def place(course: Course, distance: float) -> tuple[float, float, float]:
 
 
 def progress(course: Course, xs: np.ndarray, ys: np.ndarray, last: float) -> np.ndarray:
-    """Unwrapped distance along the centre line of each position, followed on from `last`.
+    """Unwrapped distance along the centre line of each position, starting from `last`.
 
-    Each position goes to the nearest place of the line within one corridor's width of where the
-    one before it was, so that neither a neighbouring straight nor the start line confuses it.
+    Each position goes to the nearest place of the line within 1.5 corridor widths of the place
+    before. So neither a neighbouring straight nor the start line confuses it.
     """
     if not len(course.line):
         return np.zeros(len(xs))
@@ -254,12 +254,12 @@ def progress(course: Course, xs: np.ndarray, ys: np.ndarray, last: float) -> np.
 def grip_speed(course: Course, car: Car) -> float:
     """The highest speed (m/s) at which every corner of a corridor can be taken without sliding.
 
-    The car's centre swings from the outer side over the inner corner to the outer side, on one arc
-    per corner. With the free width w (the corridor's, less the car's width), an arc of radius R
-    about a corner of angle a fits if R (1 - cos(a/2)) <= w; and neighbouring arcs share the
-    straight between them: R (tan(a/2) + tan(b/2)) <= its length where the car drives. Then
-    v² = mu g R. Each axle carries its own share of the weight round a steady turn, so the one
-    with the lesser mu lets go first.
+    The car's centre takes one arc per corner, from the outer side over the inner corner to the
+    outer side. The free width w is the corridor's less the car's. An arc of radius R about a corner
+    of angle a fits if R (1 - cos(a/2)) <= w. Neighbouring arcs share the straight between them:
+    R (tan(a/2) + tan(b/2)) <= its length where the car drives. Then v² = mu g R. In a steady turn
+    each axle carries its own share of the weight, so the one with the lesser mu slides first.
+    Without corners the speed is inf.
     """
     if course.width is None or not course.turns:
         return math.inf

@@ -1,4 +1,4 @@
-"""Courses in files: TOML here; centre lines and maps by the files beside this one."""
+"""Courses in files: TOML here, others by `centre_line` and `occupancy_map`."""
 
 import dataclasses
 import importlib.resources
@@ -35,7 +35,7 @@ def load_course(name: str) -> Course:
     A `.csv` is a centre line with widths (F1TENTH), a `.yaml` an occupancy map (ROS).
     """
     path = Path(name)
-    # Imported here, as geometry and pictures take their time to load.
+    # Imported here, as libraries for geometry and images load slowly.
     if path.suffix == ".csv":
         from countersteer.course.centre_line import read_centre_line
 
@@ -49,7 +49,7 @@ def load_course(name: str) -> Course:
 
 
 def course_from_tables(tables: dict[str, Any], where: str) -> Course:
-    """The course that the tables of a file describe."""
+    """The course that the tables of a file describe. Raises `InputError` naming `where`."""
     for key in tables:
         if key not in KEYS:
             raise unknown_key(where, key, dict.fromkeys(KEYS))
@@ -72,7 +72,7 @@ def course_from_tables(tables: dict[str, Any], where: str) -> Course:
         raise InputError(f"{where}: segments must be a list of {{straight_m}} and {{turn_deg}}")
     read = [_segment(s, f"{where}: segments[{i}]") for i, s in enumerate(segments)]
     course = from_segments(where, width, closed, read, (start[0], start[1], start[2]), goal)
-    return dataclasses.replace(course, name=title)  # until here its errors name the file
+    return dataclasses.replace(course, name=title)  # errors before this line name the file
 
 
 def _segment(segment: dict[str, Any], where: str) -> tuple[str, float, float]:
@@ -100,7 +100,7 @@ def _place(tables: dict[str, Any], key: str, where: str, known: tuple[str, ...])
 
 
 def _walls(lines: Any, where: str) -> np.ndarray:
-    """Polylines of points as segments."""
+    """Wall segments (m, 4) of polylines."""
     if not isinstance(lines, list) or not lines:
         raise InputError(f"{where}: walls_m must be a list of lists of [x, y]")
     walls = []
@@ -124,7 +124,7 @@ def _number(value: Any, where: str, low: float, high: float) -> float:
 
 
 def course_tables(course: Course) -> dict[str, Any]:
-    """What `run.toml` says of a course: enough to draw it and to drive it again."""
+    """The tables of a course in `run.toml`: enough to draw it and to drive it again."""
     tables: dict[str, Any] = {
         "name": course.name,
         "closed": course.closed,
@@ -151,7 +151,7 @@ def course_tables(course: Course) -> dict[str, Any]:
 
 
 def course_of_run(about: dict[str, Any]) -> Course | None:
-    """The course that a `run.toml` holds, as `course_tables` wrote it; None without one."""
+    """The course in a `run.toml`, as `course_tables` wrote it; None without one."""
     tables = about.get("course")
     if not isinstance(tables, dict) or not isinstance(tables.get("walls_m"), list):
         return None

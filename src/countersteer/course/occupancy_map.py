@@ -15,18 +15,18 @@ from scipy import ndimage
 from countersteer.course.course import Course, from_track, from_walls, walls_around
 from countersteer.errors import InputError
 
-TOLERANCE = 0.02  # m by which walls may be from the edge between pixels, ...
-PIXELS = 1.0  # ... or so many pixels, if that is more: a slanting edge is a staircase
-SPECK = 4  # pixels: what is smaller within free space is noise, not a wall
+TOLERANCE = 0.02  # m, largest distance of walls from the edge between pixels, ...
+PIXELS = 1.0  # ... or so many pixels, if that is more: a slanted edge is a staircase
+SPECK = 4  # pixels: a smaller patch within free space is noise, not a wall
 SMOOTH = 4.0  # pixels: standard deviation of the filter along a centre line
 MOST_PIXELS = 40_000_000
 FORMATS = ("PNG", "PPM", "BMP", "JPEG")
-FREE_THRESH = 0.25  # where the file says nothing: that of ROS 2
-AROUND = np.ones((3, 3))  # walls hold together at corners too; free space at edges only
+FREE_THRESH = 0.25  # default, that of ROS 2
+AROUND = np.ones((3, 3))  # pixels of walls connect at corners too, free pixels at edges only
 
 
 class Grid(NamedTuple):
-    """Pixels in the plane."""
+    """The place of an image's pixels in the plane."""
 
     resolution: float  # m
     x: float  # of the lower left corner
@@ -34,7 +34,7 @@ class Grid(NamedTuple):
     yaw: float
 
     def place(self, pixels: np.ndarray) -> np.ndarray:
-        """(n, 2) column and row, counted from the lower left pixel's middle, as x and y."""
+        """Points (n, 2) of column and row (n, 2), counted from the lower left pixel's middle."""
         along = (pixels + 0.5) * self.resolution
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         return along @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x, self.y]
@@ -48,14 +48,15 @@ class Grid(NamedTuple):
 
 
 def read_map(path: Path) -> Course:
-    """The course that a map's free space makes.
+    """The course in a map's free space.
 
-    Walls are the edge of the free pixels that hang together with the origin (0, 0), or with the
-    one nearest to it. Unknown pixels are not free. Between one outer and one inner edge there is a
-    closed course: its centre line is as far from the one as from the other, it starts nearest to
-    the origin and goes the way on which x rises there, or the other with `reverse: true` in the
-    file. Any other free space has free walls, and the car starts at the origin, heading 0.
-    Raises `InputError` naming file and key.
+    Free space is the free pixels connected with the origin (0, 0), or with the free pixel nearest
+    to it. Unknown pixels are not free. Walls are the edge of free space.
+
+    Between one outer and one inner edge there is a closed course. Its centre line is equally far
+    from both. It starts nearest to the origin, in the direction in which x rises, or in the other
+    one with `reverse: true` in the file. Any other free space has free walls, and the car starts at
+    the origin, heading 0. Raises `InputError` naming file and key.
     """
     about = _about(path)
     grid, image = _grid(about, path), path.parent / str(about.get("image"))
@@ -68,11 +69,11 @@ def read_map(path: Path) -> Course:
     at_origin = np.max(np.abs([columns[nearest], rows[nearest]] - begin)) <= 0.5
     labels, _ = ndimage.label(free)
     region = labels == labels[rows[nearest], columns[nearest]]
-    # Cut out, with a margin of one pixel that is not free.
+    # Crop to the region, with a margin of one pixel that is not free.
     rows, columns = (np.nonzero(np.any(region, axis=axis))[0] for axis in (1, 0))
     low = np.array([columns[0], rows[0]])
     region = np.pad(region[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
-    solid, count = ndimage.label(~region, structure=AROUND)  # 1 is what lies outside
+    solid, count = ndimage.label(~region, structure=AROUND)  # 1 is the outside
     sizes = np.bincount(solid.ravel(), minlength=count + 1)
     region |= (sizes < SPECK)[solid]
     solid = np.where(region, 0, solid)
@@ -117,7 +118,7 @@ def _grid(about: dict[str, Any], path: Path) -> Grid:
 
 def _number(value: Any, where: str, low: float, high: float) -> float:
     try:
-        read = math.nan if isinstance(value, bool) else float(value)  # YAML takes 5e-2 for a text
+        read = math.nan if isinstance(value, bool) else float(value)  # YAML reads 5e-2 as text
     except (TypeError, ValueError):
         read = math.nan
     if not low <= read <= high:
@@ -133,7 +134,7 @@ def _flag(about: dict[str, Any], key: str, path: Path) -> bool:
 
 
 def _free(about: dict[str, Any], path: Path, image: Path) -> np.ndarray:
-    """Which pixels are free, the lowest row first: less likely occupied than `free_thresh`."""
+    """Mask of free pixels, lowest row first: their occupancy is below `free_thresh`."""
     mode = about.get("mode", "trinary")
     if mode not in ("trinary", "scale", "raw"):
         raise InputError(f"{path}: mode must be trinary, scale or raw, not {mode!r}")
@@ -168,8 +169,8 @@ def _free(about: dict[str, Any], path: Path, image: Path) -> np.ndarray:
 
 
 def _outline(region: np.ndarray, grid: Grid, low: np.ndarray) -> shapely.Polygon:
-    """The pixels of a region as an area, along their edges."""
-    # A little over one half: where only corners meet, walls hold together, as in the labels.
+    """The polygon of a region, along the edges of its pixels."""
+    # A little over one half: walls connect where only corners meet, as in the labels.
     contours = contourpy.contour_generator(z=region.astype(float), fill_type="OuterOffset")
     filled: Any = contours.filled(0.501, 2.0)
     (points,), (offsets,) = filled
@@ -178,10 +179,10 @@ def _outline(region: np.ndarray, grid: Grid, low: np.ndarray) -> shapely.Polygon
 
 
 def _middle(outer: np.ndarray, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The closed line as far from `outer` as from `inner`, and that distance, in pixels.
+    """The closed line equally far from `outer` and `inner`, and its room to both, in pixels.
 
-    Counter-clockwise, its points 2 pixels apart. There is one such line: who is nearer to `outer`
-    stays so on the way to it.
+    It runs counter-clockwise, its points 2 pixels apart. There is only one such line: a point
+    nearer to `outer` stays nearer on its way to `outer`.
     """
     away = [np.asarray(ndimage.distance_transform_edt(~solid)) for solid in (outer, inner)]
     lines: Any = contourpy.contour_generator(z=away[0] - away[1]).lines(0.0)
@@ -201,7 +202,7 @@ def _middle(outer: np.ndarray, inner: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _start(
     line: np.ndarray, sides: np.ndarray, about: dict[str, Any], path: Path
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The line from its point nearest to the origin on, in the direction in which it is driven."""
+    """Line and sides from the point nearest to the origin on, in the driving direction."""
     first = int(np.argmin(np.hypot(*line.T)))
     ahead = line[(first + 1) % len(line)] - line[first - 1]
     if (ahead[0] < 0) != _flag(about, "reverse", path):

@@ -1,3 +1,3 @@
-"""Drivers: from what the sensors tell to what the car is asked for. One driver a file."""
+"""Drivers: each computes commands from observations. One driver a file."""
 
-DRIVERS = ("drift-turn", "straighten")  # of the library; plans have their names beside these
+DRIVERS = ("drift-turn", "straighten")  # of the library; `plan.library` names its plans

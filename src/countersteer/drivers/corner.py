@@ -1,4 +1,4 @@
-"""Turns one corner of 90° on the ground truth, by grip or by drift: the best that a law can do."""
+"""Turns one corner of 90° by grip or by drift, on ground truth: the best that a law can do."""
 
 import math
 from typing import NamedTuple
@@ -16,7 +16,7 @@ AHEAD, TURN, STOP, SETTLE = 0, 1, 2, 3
 
 
 class CornerMemory(NamedTuple):
-    """What the driver is about."""
+    """The driver between two decisions."""
 
     phase: Scalar
     entry: Scalar  # m/s
@@ -24,14 +24,14 @@ class CornerMemory(NamedTuple):
 
 @pytree
 class Corner:
-    """A left turn of 90° begun at x; told the truth. `slides`: by the laws of drift-turn."""
+    """A left turn of 90° that begins at a given x. If it `slides`, drift-turn's laws drive it."""
 
     turning: Turning
     stop_angle: StopAngle
     slides: Scalar  # 1 by drift, 0 by grip
     speed: Scalar
     begin: Scalar  # x at which the wheels turn over, m
-    lock: Scalar  # by grip, rad
+    lock: Scalar  # largest, by grip, rad
     hold: Scalar  # throttle that holds the speed
     power: Scalar  # by drift: factor on the throttle of the spin
     limit: Scalar
@@ -68,7 +68,7 @@ class Corner:
         ):
             steering = jnp.where(phase == which, lock, steering)
             throttle = jnp.where(phase == which, power, throttle)
-        # By grip the lock is given back in time for the car to come out straight.
+        # By grip, the lock decreases in time for the car to leave the corner straight.
         arc = jnp.clip(2.0 * left_over - 0.25 * seen.yaw_rate, -self.lock, self.lock)
         slides, ahead = self.slides > 0, phase == AHEAD
         steering = jnp.where(slides | ahead, steering, arc)

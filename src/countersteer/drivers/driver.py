@@ -1,4 +1,4 @@
-"""What every driver is given and gives back."""
+"""The interface of drivers: an `Observation` in, a `Command` out."""
 
 import math
 from collections.abc import Callable
@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from countersteer.estimation.estimate import Estimate
 from countersteer.signals import Command, Scalar
 
-ROUNDING = 2e-5  # s, of a time in 32 bits
-THINKS = 0.005  # s between two thoughts of a driver: as often as gyroscope and estimate have news
+ROUNDING = 2e-5  # s, rounding error of a time in 32 bits
+THINKS = 0.005  # s between two decisions of a driver; gyroscope and estimate are as frequent
 
 
 class Heard(NamedTuple):
@@ -21,7 +21,7 @@ class Heard(NamedTuple):
     age: Scalar  # s since it was taken; inf before the first
 
     def came(self, within: Scalar) -> Scalar:
-        """Whether it was taken in the last so many seconds, the beginning not counted."""
+        """Whether it was taken less than `within` seconds ago; False at exactly `within`."""
         return self.age < within - ROUNDING
 
 
@@ -30,7 +30,7 @@ class Observation(NamedTuple):
 
     time: Scalar  # s since the start
     sonar: tuple[Heard, ...]  # m, in the order of the car's mounts; inf: no echo
-    encoder_counts: Heard  # regions passed, blind to direction
+    encoder_counts: Heard  # regions passed, in either direction
     wheel_speed: Heard  # m/s, never negative
     gyroscope: Heard  # rad/s
     accel_x: Heard  # m/s²
@@ -41,29 +41,29 @@ class Observation(NamedTuple):
     lidar: Heard | None  # (beams,), m, from right to left; inf: no echo; None: the car has none
     position_x: Heard | None  # m, in the world's axes; None: the car has no such sensor
     position_y: Heard | None
-    position_heading: Heard | None  # rad, in ±pi; None: the sensor tells none
+    position_heading: Heard | None  # rad, in ±pi; None: the sensor reports none
     estimate: Estimate
 
 
 class Status(NamedTuple):
-    """What a driver says it is about, for records and pages. Nothing is judged by it."""
+    """What a driver reports about itself, for records and pages. The judge does not rely on it."""
 
-    turn: Scalar = 0  # turns that it has handed over to
-    phase: Scalar = 0  # of the turn, as the driver's `phases` name them; 0: none
-    offset: Scalar = math.nan  # left of its corridor's middle, as it believes, m
-    angle: Scalar = math.nan  # to the corridor, rad
-    offset_deviation: Scalar = math.inf  # of the two, as far as it says
-    angle_deviation: Scalar = math.inf
-    doubts: Scalar = 0  # readings in a row of the front sonar that it holds for spikes
+    turn: Scalar = 0  # turns that it has begun
+    phase: Scalar = 0  # of the turn: an index into the driver's `phases`; 0: none
+    offset: Scalar = math.nan  # estimated, left of the corridor's middle, m
+    angle: Scalar = math.nan  # estimated, to the corridor, rad
+    offset_deviation: Scalar = math.inf  # standard deviation, m; inf: unknown
+    angle_deviation: Scalar = math.inf  # rad
+    doubts: Scalar = 0  # front sonar readings in a row that it takes for spikes
 
 
 class Driver(Protocol):
-    """Made for a course and a nominal car.
+    """A driver, made for a course and a nominal car.
 
-    A driver that is a pytree (such as one made with `countersteer.car.parameter.pytree`) is traced
-    by JAX: scanned, and batched. Any other object is called from Python, once a control period;
-    it may have a `period` (s), or else decides 200 times a second at most.
-    It may have `status(memory)`, which gives a `Status`: what it is about.
+    JAX traces, scans and batches a driver that is a pytree, such as one made with
+    `countersteer.car.parameter.pytree`. Any other object is called from Python, once a control
+    period. Its optional `period` (s, default 0.005) is the least time between two calls.
+    Its optional method `status(memory)` returns a `Status`.
     """
 
     def reset(self, key: jax.Array) -> Any:
@@ -76,7 +76,7 @@ class Driver(Protocol):
 
 
 def status_of(driver: Any, memory: Any) -> Status:
-    """What the driver says it is about; nothing where it says none."""
+    """The driver's status; the default `Status` if it has no method `status`."""
     found: Status = driver.status(memory) if hasattr(driver, "status") else Status()
     return found
 
@@ -87,9 +87,9 @@ def paced(
     seen: Observation,
     period: float = THINKS,
 ) -> tuple[Command, Any]:
-    """Thinks when it is time to, and asks for the same as before in between.
+    """Call `think` once a `period` (s), and repeat its last command in between.
 
-    The memory has a `time`, that of the last thought, and the `command` that came of it.
+    The memory has the fields `time`, of the last call, and `command`, its result.
     """
 
     def typed(memory: Any, seen: Observation) -> tuple[Command, Any]:

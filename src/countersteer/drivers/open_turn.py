@@ -1,4 +1,4 @@
-"""One turn in the open, stopped at a yaw rate: nothing but that is asked on the way."""
+"""One turn in the open, stopped at a yaw rate; the turn uses no other measurement."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ AHEAD, SPIN, STOP = 0, 1, 2
 
 
 class OpenTurnMemory(NamedTuple):
-    """What the driver is about."""
+    """The driver between two decisions."""
 
     phase: Scalar
     spun: Scalar  # when the wheels turned over, s
@@ -27,14 +27,13 @@ class OpenTurnMemory(NamedTuple):
 
 @pytree
 class OpenTurn:
-    """Runs up, spins as `Turning.spin` says, and stops as `Turning.stop` does with nothing missing.
+    """Runs up, spins by `Turning.spin`, and stops by `Turning.stop` with no missing angle.
 
-    The throttle is killed at the yaw rate `kill`, or after `longest` seconds where that does not
-    come.
+    The throttle is killed at the yaw rate `kill`, or `longest` seconds after the spin began.
     """
 
     turning: Turning
-    speed: Scalar  # of entry, m/s: what the run-up holds
+    speed: Scalar  # of entry, m/s; the run-up holds it
     hand: Scalar  # 1 left, -1 right
     kill: Scalar  # rad/s, in the turn's hand
     longest: Scalar  # s
@@ -71,14 +70,14 @@ class OpenTurn:
         return command, OpenTurnMemory(phase, spun, jnp.where(phase == AHEAD, 0, 1))
 
     def status(self, memory: OpenTurnMemory) -> Status:
-        """The turn, once it has begun."""
+        """The turn (1 once it has begun) and its phase."""
         return Status(memory.turn, memory.phase)
 
 
 def open_turn(
     car: Car, turning: Turning, speed: float, hand: int, kill: float, longest: float
 ) -> OpenTurn:
-    """For a nominal car: by a left (1) or right (-1) hand, killed at a yaw rate (rad/s)."""
+    """For a nominal car. `hand` is 1 (left) or -1 (right); `kill` is a yaw rate (rad/s)."""
     return OpenTurn(
         turning=turning,
         speed=speed,

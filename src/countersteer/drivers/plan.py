@@ -1,7 +1,7 @@
 """A course's plan: policies, the places where each holds, and the conditions that hand over.
 
-Read from a TOML file (docs/plans.md). Policies that only play commands and policies that look at
-the car mix; all share what is known of the corridor, which is followed whichever of them steers.
+A plan is read from a TOML file (docs/plans.md). Open-loop and closed-loop policies mix. All share
+one estimate of the car's place in the corridor. It is updated whichever policy steers.
 """
 
 import dataclasses
@@ -32,73 +32,73 @@ from countersteer.text import read_toml
 LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
 KINDS = STRAIGHTEN, COMMANDS, DRIFT, CURVE = range(4)
 NAMES = ("straighten", "commands", "drift", "curve")
-ASTRAY = 0.5  # m outside its place from which on a policy has missed its hand-over
-ALIGNED = 0.3  # rad to the corridor within which what the front sonar sees stands at its end
+ASTRAY = 0.5  # m outside its place, beyond which a policy has missed its hand-over
+ALIGNED = 0.3  # rad to the corridor, within which the front sonar sees the corridor's end
 AHEAD = (0.2, 0.15)  # how far a curve looks ahead: m, and s at the car's speed
-REVERSE = 0.05  # m/s by which the car may come nearer to a wall than its forward speed says
+REVERSE = 0.05  # m/s by which the car may approach a wall faster than its forward speed
 
 
 class Until(NamedTuple):
-    """When a policy hands over: at the first of these. SI; what is never reached is infinite."""
+    """Conditions on which a policy hands over; one is enough. SI; infinite: never met."""
 
     driven: Array  # m since it began, by odometry
     turned: Array  # rad since it began, to the left
     time: Array  # s since it began
-    wall: Array  # m to the wall ahead, or less
+    wall: Array  # m to the wall ahead, or less; never: -inf
     passes: Array  # m along the centre line
-    yaw_rate: Array  # rad/s, once it has been above
+    yaw_rate: Array  # rad/s, or less, after it has been above
     speed: Array  # m/s, or more
 
 
 class Policies(NamedTuple):
-    """All of them: each array has a row for each, in their order."""
+    """All policies of a plan: each array has a row for each policy, in their order."""
 
     does: Array  # one of `KINDS`
     speed: Array  # m/s
-    angle: Array  # by which the corridor turns as it begins, rad
+    angle: Array  # by which the corridor turns where the policy begins, rad
     begin: Array  # place where it holds, m along the centre line; infinite: everywhere
     end: Array
     until: Until
-    times: Array  # (n, m) s since it began, of its commands; infinite behind the last
+    times: Array  # (n, m) times of its commands since it began, s; infinite after the last
     throttle: Array
     steering: Array  # rad
 
 
 class SequenceMemory(NamedTuple):
-    """What the driver is about."""
+    """The driver between two decisions."""
 
-    number: Scalar  # of the policy that holds
-    begun: Scalar  # whether it has
+    number: Scalar  # of the current policy
+    begun: Scalar  # 1 once it has begun
     turn: Scalar  # turns begun
-    since: Scalar  # s, and so on: when it began
-    heading: Scalar
-    distance: Scalar
-    driven: Scalar  # m since
-    stirred: Scalar  # whether the yaw rate was above its limit since
+    since: Scalar  # time at which it began, s
+    heading: Scalar  # at that time, rad
+    distance: Scalar  # at that time, along the centre line, m
+    driven: Scalar  # m since then
+    stirred: Scalar  # 1 if the yaw rate has been above its limit since then
     along: Scalar  # distance along the centre line, m
     echo: spikes.SpikeMemory
-    drift: drift_turn.DriftTurnMemory  # with what is known of the corridor
+    drift: drift_turn.DriftTurnMemory  # includes the place in the corridor
 
     @property
     def time(self) -> Scalar:
-        """Of the last thought (s)."""
+        """Time of the last decision (s)."""
         return self.drift.time
 
     @property
     def command(self) -> Command:
-        """The last."""
+        """The last command."""
         return self.drift.command
 
 
 @pytree
 class PolicySequence:
-    """Policies in their order; where the pose tells another's place, that one takes over.
+    """Policies in their order. If the pose is in the place of another, that one takes over.
 
-    The one after the last is the first where the course is closed; else the last holds to the end.
+    On a closed course the first follows the last. On an open one the last holds to the end.
     """
 
     policies: Policies
-    drift: DriftTurn  # by which all drifts are driven; its `straight` is everyone's
+    drift: DriftTurn  # drives all drifts; all policies share its `straight`
     line: Line
     noise: Scalar  # of a sonar's distance, m
     wheelbase: Scalar
@@ -106,7 +106,7 @@ class PolicySequence:
 
     @property
     def straight(self) -> Straighten:
-        """What keeps to the corridor's middle."""
+        """The driver that keeps to the corridor's middle."""
         return self.drift.straight
 
     def reset(self, key: jax.Array) -> SequenceMemory:
@@ -123,7 +123,7 @@ class PolicySequence:
         return paced(self._think, memory, observation)
 
     def status(self, memory: SequenceMemory) -> Status:
-        """The turns that it has begun, and where it believes to be in its corridor."""
+        """The turns begun, and the estimated place in the corridor."""
         return self.drift.status(memory.drift)._replace(turn=memory.turn)
 
     def _think(self, memory: SequenceMemory, seen: Observation) -> tuple[Command, SequenceMemory]:
@@ -140,7 +140,7 @@ class PolicySequence:
             echo=heard,
         )
         number, begins = self._next(memory, before, seen, here)
-        # What was ahead in a turn says nothing of the straight behind it.
+        # An echo from before a hand-over says nothing about the wall ahead after it.
         memory = memory._replace(
             echo=heard._replace(
                 believed=jnp.where(begins, jnp.inf, heard.believed),
@@ -154,7 +154,7 @@ class PolicySequence:
         last = memory.drift._replace(
             turn=1, phase=jnp.where(begins, drift_turn.STRAIGHT, memory.drift.phase)
         )
-        # One of linked turns, after the first, begins at once where there is an angle to turn.
+        # As a linked turn after the first (`turn=1`), a drift with an angle begins at once.
         angles = jnp.stack([0.0 * angle, jnp.where(drifts, angle, 0.0)])
         turning, drift = dataclasses.replace(self.drift, angles=angles).think(last, seen)
         straight = self.straight.turned(drift.straight, angle, begins & ~drifts)
@@ -185,15 +185,15 @@ class PolicySequence:
         return command, memory._replace(drift=drift)
 
     def _policy(self, number: Scalar) -> Policies:
-        """One of them."""
+        """The policy of this number."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[number], self.policies)
 
     def _next(
         self, memory: SequenceMemory, own: Policies, seen: Observation, here: Place
     ) -> tuple[Scalar, Scalar]:
-        """The policy from now on, and whether it begins now."""
+        """The number of the policy from now on, and whether it begins now."""
         until, estimate, count = own.until, seen.estimate, len(self.policies.does)
-        # On a closed course each round has the place: it is the one that lay ahead as the policy
+        # On a closed course each round has the place. The one that counts lay ahead as the policy
         # began, or less than a quarter of a round behind.
         open_ended, behind = jnp.isinf(self.line.whole), memory.distance - self.line.whole / 4
         coming = behind + jnp.mod(until.passes - behind, self.line.whole)
@@ -215,8 +215,8 @@ class PolicySequence:
             jnp.minimum(memory.number + 1, count - 1),
             (memory.number + 1) % count,
         )
-        # Who believes its pose to half a metre, and is elsewhere, has missed a hand-over; and a
-        # condition that is met where the next has no place was something else's.
+        # If the pose is known to half a metre and is outside the policy's place, a hand-over was
+        # missed. A condition that is met outside the next policy's place is a false one.
         spread = estimate.pose_covariance
         sure = spread.xx + spread.yy < ASTRAY**2
         holds, inside = self._places(here.distance)
@@ -229,7 +229,7 @@ class PolicySequence:
         return number, over | mends | (memory.begun == 0)
 
     def _places(self, distance: Scalar) -> tuple[Array, Array]:
-        """(n,) whether each may hold at a distance, and whether it has its own place there."""
+        """Masks (n,): policies that may hold at a distance, and those whose own place it is."""
         begin, end = jnp.asarray(self.policies.begin), jnp.asarray(self.policies.end)
         everywhere = jnp.isinf(begin)
         begin, end = jnp.where(everywhere, 0.0, begin), jnp.where(everywhere, 0.0, end)
@@ -242,16 +242,16 @@ class PolicySequence:
     def _heard(
         self, memory: spikes.SpikeMemory, seen: Observation, dt: Scalar
     ) -> spikes.SpikeMemory:
-        """What is ahead by the front sonar, without spikes."""
+        """The distance ahead by the front sonar, without spikes."""
         heard = seen.sonar[self.drift.front]
         tick = jnp.where(heard.came(dt), memory.tick + 1, memory.tick)
         nearer = dt * (jnp.abs(seen.estimate.vx) + REVERSE)
         return spikes.update(memory, spikes.Reading(heard.value, tick), nearer, self.noise)
 
     def _pursued(self, estimate: Estimate, here: Place) -> Scalar:
-        """Lock to a point of the centre line ahead: pure pursuit (Coulter 1992).
+        """Lock (rad) towards a point of the centre line ahead: pure pursuit (Coulter 1992).
 
-        lock = atan(2 wheelbase sin(a) / l), with l and a the distance and the bearing of the point
+        lock = atan(2 wheelbase sin(a) / l). l and a are the distance and the bearing of the point
         from the rear axle.
         """
         ahead = AHEAD[0] + AHEAD[1] * jnp.maximum(estimate.vx, 0.0)
@@ -264,12 +264,12 @@ class PolicySequence:
 
 
 class Key(NamedTuple):
-    """A number in a file: its range there, and what one of its unit is inside."""
+    """A number in a file: its range there, and the SI value of one of its units."""
 
     low: float
     high: float
     unit: float = 1.0
-    never: float = math.inf  # what stands where it is not given
+    never: float = math.inf  # value if the key is absent
 
 
 DEGREE = math.pi / 180
@@ -291,7 +291,7 @@ TAKES: dict[str, dict[str, Key]] = {
     "curve": {"speed_mps": Key(0.1, 20)},
 }
 LEAST_DRIFT = 20  # degrees
-Read = Callable[[Path], Mapping[str, np.ndarray]]  # of a commands.csv: time_s, throttle, steering
+Read = Callable[[Path], Mapping[str, np.ndarray]]  # a commands.csv as time_s, throttle, steering
 
 
 def plan(
@@ -303,9 +303,9 @@ def plan(
     speed: float | None = None,
     laps: int = 1,
 ) -> PolicySequence:
-    """For a course and a nominal car, from the tables of a file that is called `where`.
+    """The driver for a course and a nominal car, from the tables of the file `where`.
 
-    `read` reads a file of commands; `speed` (m/s) is that of policies which name none. Raises
+    `read` reads a file of commands. `speed` (m/s) is for policies that name none. Raises
     `InputError` naming file, policy, key and range.
     """
     if not len(course.line):
@@ -332,7 +332,7 @@ def plan(
         )
         for row in read_rows
     ]
-    # Its corners are the plan's to tell.
+    # The plan gives the corners, so the course of its drifts has none.
     straight_on = dataclasses.replace(course, turns=(), closed=False)
     drift = drift_turn.drift_turn(straight_on, car, speed, laps, by="wall")
     return PolicySequence(
@@ -346,7 +346,7 @@ def plan(
 
 
 def library() -> dict[str, str]:
-    """Names of the plans that come with the package, and what they say of themselves."""
+    """Names and descriptions of the plans that come with the package."""
     names = sorted(p.name.removesuffix(".toml") for p in LIBRARY.iterdir())
     tables = {name: read_toml(name, LIBRARY, "driver")[0] for name in names}
     return {n: str(t["description"]) for n, t in tables.items() if t["kind"] == "plan"}
@@ -355,7 +355,7 @@ def library() -> dict[str, str]:
 def _policy(
     row: dict[str, Any], where: str, speed: float, length: float, folder: Path, read: Read
 ) -> Policies:
-    """One table; `where` names file and policy, `folder` is that of the file."""
+    """One policy from its table. `where` names file and policy; `folder` is the file's."""
     does = row.get("does")
     if does not in NAMES:
         raise InputError(f"{where}: does must be one of {', '.join(NAMES)}, not {does!r}")
@@ -411,7 +411,7 @@ def _policy(
 
 
 def _number(table: dict[str, Any], key: str, span: Key, where: str, path: str = "") -> float:
-    """A number in the units used inside, or what stands for none."""
+    """A number in SI units, or `span.never` if the key is absent."""
     if key not in table:
         return span.never
     value = table[key]

@@ -1,4 +1,4 @@
-"""Plays recorded commands in a turn: open loop, between a driver that goes on before and after."""
+"""Plays recorded commands in a turn, open loop. Another driver drives before and after it."""
 
 import math
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ STEP = 0.01  # s between the recorded commands
 
 
 class PlayedTurnMemory(NamedTuple):
-    """Of the driver within, and when the turn began (s)."""
+    """The inner driver's memory, its turns, and when the turn began (s)."""
 
     inner: Any
     turn: Scalar
@@ -25,7 +25,7 @@ class PlayedTurnMemory(NamedTuple):
 
 @pytree
 class PlayedTurn:
-    """A turn's commands played back from where the driver within hands over to it."""
+    """Plays a turn's commands, from the moment at which the inner driver begins the turn."""
 
     inner: DriftTurn
     throttle: np.ndarray  # each `STEP` seconds from the turn's beginning
@@ -36,7 +36,7 @@ class PlayedTurn:
         return PlayedTurnMemory(self.inner.reset(key), 0, math.inf)
 
     def status(self, memory: PlayedTurnMemory) -> Status:
-        """That of the driver within."""
+        """The inner driver's status."""
         return self.inner.status(memory.inner)
 
     def act(
@@ -52,7 +52,7 @@ class PlayedTurn:
         playing = (index >= 0) & (index < count)
         at = jnp.clip(jnp.where(playing, index, 0), 0, count - 1).astype(jnp.int32)
         throttle, steering = jnp.asarray(self.throttle)[at], jnp.asarray(self.steering)[at]
-        # What the driver within made of the turn is not asked: behind it, it straightens.
+        # After the turn the inner driver straightens, whichever phase it has reached.
         over = (index >= count) & (now - begun < (count + 2) * STEP)
         inner = inner._replace(phase=jnp.where(over, STRAIGHT, inner.phase))
         command = Command(

@@ -11,8 +11,8 @@
     [source]
     stop_angle = "where these numbers are from"
 
-Tables hold a number for each speed. Numbers with a default in `Turning` may be left out. A table
-that is not there is that of the library's `drift-turn.toml`, which has them all.
+A list holds a number for each speed. Numbers with a default in `Turning` may be left out. An
+absent table is replaced by that of the library's `drift-turn.toml`, which has all tables.
 """
 
 import dataclasses
@@ -36,17 +36,17 @@ MOST_SPEEDS = 32
 
 
 class Entry(NamedTuple):
-    """How a field stands in a file: its key, whether one for each speed, unit and range there."""
+    """How a file holds a field: key, unit and range."""
 
     key: str
-    by_speed: bool
-    unit: str
-    low: float
+    by_speed: bool  # True: a list with a number for each speed
+    unit: str  # inside; `EDGE` has that of the file
+    low: float  # in the unit of the file
     high: float
 
     @property
     def declared(self) -> Declaration:
-        """With the range in the unit used inside."""
+        """The declaration, with the range in the unit used inside."""
         factor = EDGE[self.unit][1]
         return Declaration(self.unit, self.low * factor, self.high * factor, self.key, "policy")
 
@@ -56,7 +56,7 @@ class Entry(NamedTuple):
         return self.key + EDGE[self.unit][0]
 
 
-# By the names of the fields inside.
+# By the names of the classes' fields.
 TABLES: dict[str, tuple[type, dict[str, Entry]]] = {
     "stop_angle": (
         StopAngle,
@@ -108,7 +108,7 @@ def load_policy(name: str) -> Policy:
 
 
 def policy_of_tables(tables: Mapping[str, Any], where: str) -> Policy:
-    """The same from the tables of a file that is called `where`."""
+    """A policy from the tables of the file `where`. Raises `InputError`."""
     known = {"kind": 0, "description": 0, "source": 0, **TABLES}
     for key in tables:
         if key not in known:
@@ -123,12 +123,12 @@ def policy_of_tables(tables: Mapping[str, Any], where: str) -> Policy:
 
 @functools.cache
 def library() -> Policy:
-    """The one that the driver has of its own."""
+    """The driver's default policy, `drift-turn.toml`."""
     return load_policy(KIND)
 
 
 def _read(where: str, part: str, table: Any) -> Any:
-    """A table as the class that it stands for."""
+    """A table as an instance of its class in `TABLES`."""
     made, entries = TABLES[part]
     if not isinstance(table, dict):
         raise InputError(f"{where}: {part} must be a table of numbers")
@@ -164,7 +164,7 @@ def _read(where: str, part: str, table: Any) -> Any:
 def policy_tables(
     turning: Turning | None = None, stop_angle: StopAngle | None = None
 ) -> dict[str, Any]:
-    """What of the two there is, as the tables of a file."""
+    """The tables of a file with the parts that are given."""
     tables = {}
     for part, value in (("stop_angle", stop_angle), ("turning", turning)):
         if value is not None:
@@ -176,7 +176,7 @@ def policy_tables(
 
 
 def _written(declared: Declaration, value: Any) -> Any:
-    """A number, or a list of them, without the last digits that degrees have from radians."""
+    """A number or a list of numbers, rounded to 9 digits: degrees from radians are not exact."""
     if np.ndim(value):
         return [_written(declared, one) for one in np.asarray(value)]
     return float(f"{write_value(declared, value):.9g}")

@@ -1,4 +1,4 @@
-"""Drivers by the names that the command line has for them, and as `run.toml` keeps them."""
+"""Drivers by their names on the command line, and by their tables in `run.toml`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,10 +26,11 @@ def make_driver(
     laps: int,
     read: Read,
 ) -> tuple[Driver, dict[str, Any]]:
-    """A driver for a course and a nominal car, and the tables by which `driver_of_tables` makes it.
+    """A driver for a course and a nominal car, and its tables for `driver_of_tables`.
 
     `name` is one of the library, a policy or plan `.toml`, or a `commands.csv`, which `read` reads.
-    `speed` (m/s) is what it is asked to bring to a turn. Raises `InputError`.
+    `speed` (m/s) is the speed that it should bring to a turn. The tables of a `commands.csv` are a
+    record only: they make no driver. Raises `InputError`.
     """
     if name.endswith(".csv"):
         if speed is not None:
@@ -50,7 +51,7 @@ def make_driver(
 def driver_of_tables(
     tables: Mapping[str, Any], course: Course, car: Car, laps: int, read: Read
 ) -> Driver:
-    """The driver of a `[driver]` table. Raises `InputError` where it is of a kind unknown here."""
+    """The driver of the table `[pilot]` in `run.toml`. Raises `InputError` for an unknown kind."""
     kind, speed = tables.get("kind"), tables.get("speed_mps")
     where, numbers = str(tables.get("file", "run.toml")), tables.get("numbers", {})
     if kind == "plan":
@@ -63,7 +64,7 @@ def driver_of_tables(
 
 
 def replay(commands: Mapping[str, np.ndarray]) -> Replay:
-    """Plays `time_s`, `throttle` and `steering` (rad)."""
+    """A driver that replays the columns `time_s`, `throttle` and `steering` (rad)."""
     return Replay(
         times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
     )

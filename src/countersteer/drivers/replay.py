@@ -8,19 +8,19 @@ from countersteer.car.parameter import pytree
 from countersteer.drivers.driver import Observation
 from countersteer.signals import Command
 
-EARLY = 1e-6  # s by which a command may come early, for times that were rounded
+EARLY = 1e-6  # s by which a command may come early, as times are rounded
 
 
 @pytree
 class Replay:
-    """Holds each command until the next one is due; before the first, the car is asked nothing."""
+    """Holds each command until the next one is due. Before the first, commands are 0."""
 
     times: np.ndarray  # s, rising
     throttle: np.ndarray
     steering: np.ndarray  # rad
 
     def reset(self, key: jax.Array) -> tuple[()]:
-        """No memory: the time tells all."""
+        """No memory: the time is enough."""
         del key
         return ()
 

@@ -1,4 +1,4 @@
-"""How far the car still turns when the turn is stopped: the paper's regression."""
+"""The stop angle: how far the car still turns after the stop begins. The paper's regression."""
 
 import jax.numpy as jnp
 
@@ -10,8 +10,8 @@ from countersteer.signals import Array, Scalar
 class StopAngle:
     """Lines over the yaw rate r at the stop, one for each region of the speed v there.
 
-    angle = offset + slope r, in rad, with r >= 0 in the turn's hand. Between the regions' middles
-    `speeds` it is interpolated; beyond the outermost theirs holds.
+    angle = offset + slope r, in rad. r >= 0 is in the turn's hand. `speeds` are the middles of the
+    regions. Between them the line is interpolated; beyond the outermost it is constant.
     """
 
     speeds: Array  # (n,) m/s, rising
@@ -20,13 +20,13 @@ class StopAngle:
     deviation: Array  # standard deviation of an angle about its line, rad
 
     def angle(self, speed: Scalar, rate: Scalar) -> Scalar:
-        """What the car is expected to turn yet (rad)."""
+        """The expected stop angle (rad)."""
         offset, slope = (interpolate(self.speeds, t, speed) for t in (self.offset, self.slope))
         return offset + slope * rate
 
 
 def interpolate(nodes: Array, table: Array, value: Scalar) -> Scalar:
-    """Linear between nodes, constant beyond; nodes and table are short, and written out."""
+    """Linear interpolation between nodes, constant beyond. The loop is unrolled: nodes are few."""
     nodes, table = jnp.asarray(nodes), jnp.asarray(table)
     found = table[0]
     for i in range(nodes.shape[0] - 1):

@@ -1,4 +1,4 @@
-"""Keeps to the middle of a corridor: PID on what sonar and gyroscope tell."""
+"""Keeps to the middle of a corridor: PID on sonar and gyroscope."""
 
 import dataclasses
 import math
@@ -16,8 +16,8 @@ from countersteer.errors import InputError
 from countersteer.estimation.wall_angle import WallAngle, wall_angle
 from countersteer.signals import Command, Scalar
 
-SPEED = 1.5  # m/s, unless another is asked for
-DOUBT = math.radians(0.5)  # of the angle between two corridors
+SPEED = 1.5  # m/s, default
+DOUBT = math.radians(0.5)  # standard deviation of the angle between two corridors
 
 
 class StraightenMemory(NamedTuple):
@@ -28,26 +28,27 @@ class StraightenMemory(NamedTuple):
     integral: Scalar  # of the offset, m s
     heading: Scalar  # the estimate's, rad
     time: Scalar
-    walls: Any  # the filter's; () without
+    walls: Any  # memory of the wall filter; () without one
     command: Command  # the last
-    turned: Scalar = 0  # corners that are behind
+    turned: Scalar = 0  # corners passed
 
 
 @pytree
 class Straighten:
-    """PID between walls, and a speed held by the throttle.
+    """PID between walls, and a throttle that holds the speed.
 
-    steering = -(p offset + i integral + d angle), the angle to the corridor standing for the
-    offset's rate. Offset and angle are those of the wall filter (`by` "filter"); or, as the paper
-    had it (`by` "sonar"), the offset comes from the side sonars, each by itself while it sees a
-    wall of the corridor, and the angle from the gyroscope alone. With `by` "pose" both are those of
-    the estimate's pose in `legs`, for a car whose pose on the course is known.
+    steering = -(p offset + i integral + d angle). The angle to the corridor stands for the offset's
+    rate. `by` selects the source of both:
+    "filter": the wall filter.
+    "sonar", as in the paper: the offset is from each side sonar that sees a wall of the corridor,
+    the angle from the gyroscope alone.
+    "pose": the estimate's pose in `legs`, for a car whose pose on the course is known.
     """
 
     speed: Scalar  # m/s
     walls: WallAngle
-    bearing: Scalar  # at the start, rad
-    hold: Scalar  # throttle per speed that holds it, s/m
+    bearing: Scalar  # heading at the start, rad
+    hold: Scalar  # throttle per speed, to hold it, s/m
     dead_zone: Scalar
     limit: Scalar  # of steering, rad
     legs: Legs
@@ -55,9 +56,9 @@ class Straighten:
     p: Scalar = 1.2  # rad/m
     i: Scalar = 0.3  # rad/(m s)
     d: Scalar = 0.9  # rad/rad
-    steepest: Scalar = 0.15  # steering that offset and integral ask for at most, rad
+    steepest: Scalar = 0.15  # largest steering for offset and integral, rad
     throttle_p: Scalar = 0.25  # s/m
-    blend: Scalar = 0.3  # part of a sonar's news that is believed at once, by sonar
+    blend: Scalar = 0.3  # part of the offset's error that a reading corrects, by "sonar"
 
     def reset(self, key: jax.Array) -> StraightenMemory:
         """In the middle of the corridor."""
@@ -70,7 +71,7 @@ class Straighten:
     def act(
         self, memory: StraightenMemory, observation: Observation
     ) -> tuple[Command, StraightenMemory]:
-        """Steers to the middle at the speed that was asked for."""
+        """Steer to the middle, at `speed`."""
 
         def think(memory: StraightenMemory, seen: Observation) -> tuple[Command, StraightenMemory]:
             memory = self.follow(memory, seen)
@@ -80,7 +81,7 @@ class Straighten:
         return paced(think, memory, observation)
 
     def status(self, memory: StraightenMemory) -> Status:
-        """Where it believes to be in its corridor."""
+        """The estimated place in the corridor."""
         told = Status(memory.turned, 0, memory.offset, memory.error)
         if self.by == "filter":
             walls = memory.walls
@@ -90,7 +91,7 @@ class Straighten:
         return told
 
     def follow(self, memory: StraightenMemory, seen: Observation) -> StraightenMemory:
-        """The memory with what is new: also while something else steers."""
+        """The memory after an observation. Call it also while something else steers."""
         dt = seen.time - memory.time
         walls: Any = ()
         if self.by == "filter":
@@ -125,14 +126,14 @@ class Straighten:
         for mount, side, x, y in zip(own.mounts, own.sides, own.xs, own.ys, strict=True):
             heard = seen.sonar[mount]
             at = side * (own.width / 2 - heard.value) - x * sine - y * cosine
-            # Not a wall of this corridor, or one seen at a slant: a gap, or a turn under way.
+            # Otherwise the wall is not of this corridor, or seen at a slant: a gap, or a turn.
             sees = (jnp.abs(at) < own.width / 2) & (jnp.abs(error) < math.radians(30))
             news = heard.came(dt) & sees
             offset = offset + jnp.where(news, self.blend * (at - offset), 0.0)
         return offset
 
     def turned(self, memory: StraightenMemory, angle: Scalar, now: Scalar) -> StraightenMemory:
-        """Where `now`: in the corridor behind a corner, of whose middle nothing is known."""
+        """If `now`: the memory in the corridor after a corner by `angle`, its offset unknown."""
         walls = memory.walls
         if self.by == "filter":
             walls = self.walls.turned(walls, angle, DOUBT)
@@ -146,7 +147,7 @@ class Straighten:
         return jax.tree.map(lambda new, old: jnp.where(now, new, old), beyond, memory)
 
     def command(self, memory: StraightenMemory, seen: Observation, speed: Scalar) -> Command:
-        """PID, and the throttle that holds a speed."""
+        """The steering of the PID, and the throttle that holds a speed."""
         aside = self.p * memory.offset + self.i * memory.integral
         steering = -(jnp.clip(aside, -self.steepest, self.steepest) + self.d * memory.error)
         asked = self.hold * speed + self.throttle_p * (speed - seen.estimate.vx)
@@ -158,7 +159,7 @@ class Straighten:
 def straighten(
     course: Course, car: Car, speed: float | None = None, by: str = "filter", laps: int = 1
 ) -> Straighten:
-    """For a course and a nominal car; `speed` in m/s."""
+    """For a course and a nominal car; `speed` in m/s. Raises `InputError` without side sonars."""
     speed = SPEED if speed is None else speed
     mount_number(car, "left"), mount_number(car, "right")
     return Straighten(
@@ -174,7 +175,7 @@ def straighten(
 
 
 def mount_number(car: Car, name: str) -> int:
-    """Where a sonar of this name is among the car's mounts. Raises `InputError`."""
+    """Index of the sonar `name` among the car's mounts. Raises `InputError` if there is none."""
     names = car.sensors.sonar.mount_names
     if name not in names:
         raise InputError(f"the driver needs a sonar mount {name}; the car has {', '.join(names)}")
@@ -182,7 +183,7 @@ def mount_number(car: Car, name: str) -> int:
 
 
 def holding_throttle(car: Car, speed: float) -> float:
-    """Throttle beyond the dead zone that holds a speed on the straight (full battery)."""
+    """Throttle beyond the dead zone that holds a speed on a straight, with a full battery."""
     wheel = speed / float(car.tires.rear.radius)
     drag = float(car.drivetrain.drag) + float(car.drivetrain.drag_viscous) * wheel
     back_emf = float(car.motor.torque_constant * car.drivetrain.gear_ratio)

@@ -1,4 +1,4 @@
-"""The battery as it is felt: a Kalman filter of its open-circuit voltage and inner resistance."""
+"""The battery: a Kalman filter of its open-circuit voltage and inner resistance."""
 
 import dataclasses
 from typing import NamedTuple
@@ -10,22 +10,22 @@ from countersteer.estimation.kalman import Covariance, correct, diagonal, predic
 from countersteer.signals import Scalar
 from countersteer.world import battery as pack
 
-CHARGES = 0.07  # of a full pack's voltage: deviation of the open-circuit voltage at the start
-WEARS = 0.6  # of a worn pack's further resistance: the same of the resistance
-DRIFTS = 0.002  # of a full pack's voltage, per root second
-CURRENT = 0.15  # part by which the nominal motor errs in the current
-GATE = 5.0
+CHARGES = 0.07  # standard deviation of the voltage at the start, over a full pack's
+WEARS = 0.6  # the same of the resistance, over what full wear adds
+DRIFTS = 0.002  # random walk of the voltage, over a full pack's, per root second
+CURRENT = 0.15  # relative error of the nominal motor's current
+GATE = 5.0  # standard deviations beyond which a reading is rejected
 
 
 class Pack(NamedTuple):
-    """What is believed of the pack: open-circuit voltage (V), inner resistance (ohm)."""
+    """Estimate of the pack: open-circuit voltage (V), inner resistance (ohm)."""
 
     mean: tuple[Scalar, ...]
     covariance: Covariance
 
 
 def initial(car: Car) -> Pack:
-    """Somewhere between full and near empty, new and worn."""
+    """A pack at charge 0.65, with a resistance halfway from the nominal to a worn pack's."""
     nominal = car.battery
     worn = nominal.resistance * nominal.wear_resistance
     voltage = pack.open_circuit(nominal, 0.65)
@@ -38,10 +38,10 @@ def initial(car: Car) -> Pack:
 def update(
     car: Car, believed: Pack, voltage: Scalar, current: Scalar, valid: Scalar, h: Scalar
 ) -> Pack:
-    """A reading of the voltmeter under a current (A): V = U - R I.
+    """The estimate after a voltmeter reading under a current I (A): V = U - R I.
 
-    `h` is the time since the last step. The pack is told apart from its resistance by currents
-    that differ; until then the two are known by their sum.
+    `h` is the time since the last step (s). Different currents separate U from R. Until then only
+    U - R I is known.
     """
     part = car.sensors.voltmeter
     mean, covariance = believed
@@ -60,7 +60,7 @@ def update(
 
 
 def as_believed(car: Car, believed: Pack) -> Battery:
-    """The nominal car's battery with the voltage and resistance believed, whatever its charge."""
+    """The nominal car's battery with the estimated voltage and resistance, at any charge."""
     voltage, resistance = believed.mean
     return dataclasses.replace(
         car.battery, full=voltage, slope=0.0, knee=0.0, resistance=resistance, wear=0.0

@@ -11,9 +11,9 @@ from countersteer.car.parameter import pytree
 from countersteer.estimation.estimate import Estimate
 from countersteer.signals import Command, Readings, Scalar
 
-ROLLING = 1.0  # yaw rate (rad/s) under which the wheels are taken to roll, so that they tell speed
-TRUST = 0.25  # part of the difference to the wheels' speed that a report of theirs takes away
-FADE = 0.3  # s in which sideways speed is forgotten while the wheels roll
+ROLLING = 1.0  # yaw rate (rad/s) below which the wheels count as rolling, and give the speed
+TRUST = 0.25  # part of the difference to the wheel speed that a report corrects
+FADE = 0.3  # s, time constant of the sideways speed's decay while the wheels roll
 
 
 class ReckoningMemory(NamedTuple):
@@ -34,11 +34,11 @@ def initial_memory(pose: tuple[float, float, float], dtype: np.dtype) -> Reckoni
 
 
 def update(memory: ReckoningMemory, readings: Readings, dt: float) -> ReckoningMemory:
-    """Takes in what the readings have that is new.
+    """The memory after the new readings.
 
-    dvx/dt = ax + r vy and dvy/dt = ay - r vx between reports of the accelerometer, the heading
-    between reports of the gyroscope. While the car hardly turns, the wheels' speed pulls vx to
-    itself, and vy fades.
+    dvx/dt = ax + r vy and dvy/dt = ay - r vx are integrated between reports of the accelerometer,
+    the yaw rate r between reports of the gyroscope. While the car hardly turns, the wheel speed
+    corrects vx, and vy decays.
     """
     old = memory.estimate
     turned = jnp.maximum(readings.gyroscope.tick - memory.gyroscope, 0) * dt
@@ -87,10 +87,10 @@ class DeadReckoning:
     def update(
         self, memory: ReckoningMemory, readings: Readings, command: Command, tick: Scalar
     ) -> ReckoningMemory:
-        """Takes in what the readings have that is new."""
+        """The memory after the new readings."""
         del command, tick
         return update(memory, readings, self.dt)
 
     def estimate(self, memory: ReckoningMemory) -> Estimate:
-        """What it has come to."""
+        """The estimate after the last update."""
         return memory.estimate

@@ -1,4 +1,4 @@
-"""What is believed of the car, and how far."""
+"""The estimate of the car's motion, and its uncertainty."""
 
 from typing import NamedTuple
 
@@ -9,9 +9,9 @@ from countersteer.world.chassis import Symmetric
 
 
 class Estimate(NamedTuple):
-    """The motion of the car as far as it is known. SI, radians; pose of the centre of mass.
+    """Estimated motion of the car. SI units, radians; the pose is of the centre of mass.
 
-    A covariance of zeros means that none is known: of dead reckoning, and of the truth itself.
+    A covariance of zeros means that none is known: of dead reckoning, and of ground truth.
     """
 
     x: Scalar
@@ -25,7 +25,7 @@ class Estimate(NamedTuple):
     friction_deviation: Scalar = 0.0
     battery: Scalar = 1.0  # open-circuit voltage over the nominal car's full pack's
     battery_resistance: Scalar = 0.0  # inside the pack, ohm
-    servo: Scalar = 1.0  # how far it turns, over the nominal car's
+    servo: Scalar = 1.0  # its gain over the nominal car's
     servo_deviation: Scalar = 0.0
     velocity_covariance: Symmetric = Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # vx, vy, yaw rate
     pose_covariance: Symmetric = Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # x, y, heading

@@ -1,4 +1,4 @@
-"""What every estimator is given and gives back, and the one that is told the truth."""
+"""The interface of estimators, and the one that returns ground truth."""
 
 from typing import Any, Protocol
 
@@ -11,10 +11,10 @@ from countersteer.signals import Command, Motion, Readings, Scalar
 
 
 class Estimator(Protocol):
-    """From readings to an `Estimate`; made for a course and a nominal car, a pytree.
+    """Makes an `Estimate` of readings. It is a pytree, made for a course and a nominal car.
 
     `period` is the least time between two updates (s); 0: one at each decision of the driver.
-    Ground truth (`Readings.truth`) comes only to one that says `takes_truth`.
+    Only an estimator with `takes_truth` receives ground truth (`Readings.truth`).
     """
 
     name: str  # for records
@@ -26,7 +26,7 @@ class Estimator(Protocol):
         ...
 
     def init(self, key: jax.Array) -> Any:
-        """The memory at the start of a drive; `key` is its own."""
+        """The memory at the start of a drive. `key` is for this estimator alone."""
         ...
 
     def update(self, memory: Any, readings: Readings, command: Command, tick: Scalar) -> Any:
@@ -34,13 +34,13 @@ class Estimator(Protocol):
         ...
 
     def estimate(self, memory: Any) -> Estimate:
-        """What is believed."""
+        """The estimate after the last update."""
         ...
 
 
 @pytree
 class Truth:
-    """Believes what is so: for drivers of full state, and as a yardstick."""
+    """Returns ground truth: for drivers of full state, and as a yardstick."""
 
     start: tuple[Scalar, Scalar, Scalar]  # x, y, heading
     name = "truth"
@@ -57,12 +57,12 @@ class Truth:
     def update(
         self, memory: Estimate, readings: Readings, command: Command, tick: Scalar
     ) -> Estimate:
-        """The true state, without a covariance. Raises `ValueError` where there is none."""
+        """The true state, without a covariance. Raises `ValueError` without ground truth."""
         del memory, command, tick
         if not isinstance(readings.truth, Motion):
             raise ValueError("the estimator truth needs ground truth: no real car tells it")
         return Estimate(*readings.truth[:6])
 
     def estimate(self, memory: Estimate) -> Estimate:
-        """The same."""
+        """The true state at the last update."""
         return memory

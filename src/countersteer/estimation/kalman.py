@@ -1,7 +1,7 @@
 """The two steps of an extended Kalman filter, for one car in plain scalars.
 
-A filter of some eight states is all sparse: its matrices are written out, and where Python knows
-a number to be zero nothing is computed. So a batch is a `vmap` without a matrix in it.
+The matrices of a filter of some eight states are sparse. They are written out: where Python knows
+that a number is zero, nothing is computed. So a batch is a `vmap` without matrices.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from countersteer.signals import Scalar
 
 Covariance: TypeAlias = tuple[tuple[Scalar, ...], ...]  # row i holds its columns i, i + 1, ...
-Row: TypeAlias = Mapping[int, Scalar]  # a row of a matrix: its entries that are not zero
+Row: TypeAlias = Mapping[int, Scalar]  # the non-zero entries of a matrix's row
 
 
 def diagonal(deviations: Sequence[Scalar]) -> Covariance:
-    """Of independent states with these standard deviations."""
+    """The covariance of independent states with these standard deviations."""
     n = len(deviations)
     return tuple(
         tuple(deviations[i] ** 2 if j == i else 0.0 * deviations[i] for j in range(i, n))
@@ -25,15 +25,15 @@ def diagonal(deviations: Sequence[Scalar]) -> Covariance:
 
 
 def entry(covariance: Covariance, i: int, j: int) -> Scalar:
-    """Of the covariance of the states i and j."""
+    """The covariance of the states i and j."""
     return covariance[min(i, j)][abs(i - j)]
 
 
 def predict(covariance: Covariance, moves: Mapping[int, Row], noise: Row) -> Covariance:
-    """(I + A) P (I + A)ᵀ + Q: `moves` holds A's rows, `noise` the diagonal of Q."""
+    """(I + A) P (I + A)ᵀ + Q. `moves` holds the rows of A, `noise` the diagonal of Q."""
     n = len(covariance)
     full = [[entry(covariance, i, j) for j in range(n)] for i in range(n)]
-    for i, row in moves.items():  # P becomes (I + A) P; rows that others use are still the old ones
+    for i, row in moves.items():  # (I + A) P, each row from the rows of the old P
         full[i] = [
             full[i][j] + sum(a * entry(covariance, k, j) for k, a in row.items()) for j in range(n)
         ]
@@ -57,11 +57,11 @@ def correct(
     valid: Scalar,
     gate: float,
 ) -> tuple[tuple[Scalar, ...], Covariance, Scalar]:
-    """One scalar measurement: mean, covariance and whether it was taken.
+    """Mean and covariance after a scalar measurement, and whether it was accepted.
 
-    `row` is the measurement's derivative by the states, `residual` measured less expected, `noise`
-    its variance. Nothing changes where `valid` is false, or where the residual exceeds `gate`
-    standard deviations: what comes in may be NaN there.
+    `row` is the measurement's derivative by the states, `residual` is measured less expected,
+    `noise` the measurement's variance. Nothing changes if `valid` is false, or if the residual
+    exceeds `gate` standard deviations. Residual and noise may be NaN then.
     """
     n = len(mean)
     across = [sum(a * entry(covariance, i, k) for k, a in row.items()) for i in range(n)]
@@ -80,7 +80,7 @@ def correct(
 
 
 def renewed(covariance: Covariance, state: int, variance: Scalar, now: Scalar) -> Covariance:
-    """With one state forgotten where `now`: of this variance, and independent of the others."""
+    """If `now`, with one state reset: to this variance, and independent of the others."""
     return tuple(
         tuple(
             jnp.where(now, variance if i == j == state else 0.0, value)

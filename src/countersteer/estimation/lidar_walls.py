@@ -1,4 +1,4 @@
-"""What a lidar's beams tell of the corridor: offset, angle, and the distance of the corner."""
+"""A lidar in a corridor: offset, angle, and the distance of the corner from its beams."""
 
 import math
 from typing import NamedTuple
@@ -10,14 +10,14 @@ from countersteer.estimation.kalman import Covariance, correct
 from countersteer.sensing.lidar import bearings
 from countersteer.signals import Array, Scalar
 
-NEAR = 0.15  # m from where a wall is believed to be within which a beam is of it
-AHEAD = math.radians(8)  # from the corridor's direction within which beams look at the wall ahead
-ALIKE = 4.0  # beams whose errors hang together, as walls are not as straight as lines
-FEWEST = 5  # beams that tell anything
+NEAR = 0.15  # m from a wall's expected place, within which a beam is of that wall
+AHEAD = math.radians(8)  # from the corridor's direction, within which beams look at the wall ahead
+ALIKE = 4.0  # beams that share one error, as walls are not exactly straight
+FEWEST = 5  # beams of a measurement, at least
 
 
 class Seen(NamedTuple):
-    """Where each beam ends in the corridor's axes: (beams,) m, from the car."""
+    """The end of each beam in the corridor's axes: (beams,) m, from the car."""
 
     along: Array
     aside: Array
@@ -25,7 +25,7 @@ class Seen(NamedTuple):
 
 
 def seen(part: Lidar, ranges: Array, angle: Scalar) -> Seen:
-    """`angle` is the car's to the corridor."""
+    """The ends of the beams of a scan. `angle` is that of the car to the corridor (rad)."""
     valid = jnp.isfinite(ranges)
     away = jnp.where(valid, ranges, 0.0)
     bearing = bearings(part) + angle
@@ -46,11 +46,11 @@ def line_up(
     fresh: Scalar,
     gate: float,
 ) -> tuple[tuple[Scalar, ...], Covariance, Scalar]:
-    """The wall filter's offset and angle (its first two states) with a scan; and whether taken.
+    """The wall filter's mean and covariance after a scan, and whether it was accepted.
 
-    A beam that ends at (l, s) on the wall of a side is off by e = side w/2 - (offset + s), which
-    the angle changes by l a radian. The mean of e, and the slope of e over l, are independent, and
-    two measurements do for all beams.
+    The scan corrects offset and angle, the first two states. A beam that ends at (l, s) on a side's
+    wall differs by e = side w/2 - (offset + s). The angle changes e by l per radian. The mean of e
+    and the slope of e over l are independent, so two measurements stand for all beams.
     """
     ends = seen(part, ranges, mean[1])
     side = jnp.sign(ends.aside)
@@ -81,7 +81,9 @@ def corner_ahead(
 ) -> tuple[Scalar, Scalar]:
     """Distance along the corridor to a corner by `angle`, and whether beams see the wall behind it.
 
-    That wall passes the corner at w/2 from it: sin|a| (l - c) - cos a (s to the hand) = w/2.
+    That wall is w/2 from the corner, which is at a distance c. So sin|a| (l - c) - cos a s = w/2
+    for a beam that ends on it. l is along the corridor from the car, s from the corridor's middle
+    to the turn's hand. `error` and `offset` are the car's angle and offset in the corridor.
     """
     ends = seen(part, ranges, error)
     hand, steep = jnp.sign(angle), jnp.maximum(jnp.sin(jnp.abs(angle)), 0.5)

@@ -1,8 +1,8 @@
 """The pose on a known course: a particle filter on sonar over the velocity filter's motion.
 
-A corridor looks alike from several places: `box` from four, which no sensor of the car tells apart.
-So a pose is a cloud of particles that holds all places which fit, and what is reported is the
-place that most of the weight is around, with the covariance there and its share of the weight.
+A corridor looks alike from several places: `box` from four. No sensor of the car distinguishes
+them. So the pose is a cloud of particles that holds all places that fit. The result is the place
+with most weight around it, with the covariance there and its share of the weight.
 """
 
 import math
@@ -22,27 +22,27 @@ from countersteer.sensing.sonar import MERGED
 from countersteer.signals import Array, Command, Reading, Readings, Scalar
 from countersteer.world.chassis import Symmetric
 
-HIT = 0.1  # m: error of a distance in a world of rays and straight walls
+HIT = 0.1  # m: standard deviation of a distance in a model of rays and straight walls
 MISSED = 0.2  # chance that a reading is of something else: an edge, a neighbour's echo, nothing
-NEWS = 0.1  # m to be driven (or a fifth of it in rad turned) until a ping's error is another one
-WALKS = (0.03, 0.03, 0.04)  # beside the filter's: forward, left (m/√s), heading (rad/√s)
-HALF = 0.5  # resampled when the effective number falls below this part of the particles
+NEWS = 0.1  # m driven until the error of a ping is independent; 1 rad turned counts as 0.2 m
+WALKS = (0.03, 0.03, 0.04)  # additional random walk: forward, left (m/√s), heading (rad/√s)
+HALF = 0.5  # resample when the effective number falls below this part of the particles
 NEAR = (0.5, math.radians(30))  # m and rad within which particles are of one hypothesis
 PERIOD = 0.025  # s between two steps of the cloud
 PARTICLES = 500
-ROUGH = (0.01, 0.01, 0.005)  # m, m, rad by which a resampled particle differs from its parent,
-WIDER = 0.04  # and by this part of the whole cloud's deviation, so that a thin cloud searches
+ROUGH = (0.01, 0.01, 0.005)  # m, m, rad: deviation of a resampled particle from its parent,
+WIDER = 0.04  # plus this part of the whole cloud's deviation, so that a thin cloud searches
 
 
 class Cloud(NamedTuple):
-    """The cloud: (particles,) each."""
+    """The particles: arrays (particles,)."""
 
     x: jax.Array
     y: jax.Array
     heading: jax.Array
     weight: jax.Array  # logarithm
     motion: Estimate  # of the velocity filter at the last step
-    ticks: tuple[Scalar, ...]  # of the sonars' readings that are in it
+    ticks: tuple[Scalar, ...]  # of the last sonar readings that were used
     key: jax.Array
 
 
@@ -57,22 +57,22 @@ class Pose(NamedTuple):
 
 
 class Located(NamedTuple):
-    """The cloud, what was best at its last step, and the velocity filter's estimate then."""
+    """The cloud, its best hypothesis, and the tick of its last step."""
 
     cloud: Cloud
     pose: Pose
-    tick: Scalar  # of that step
+    tick: Scalar
 
 
 @pytree
 class PoseFilter:
-    """For a course (walls (n, 4), rows of NaN are padding) and the nominal car's sonar."""
+    """The particle filter for walls (n, 4), padded with rows of NaN, and the nominal sonar."""
 
     walls: Array
     sonar: Sonar
 
     def uniform(self, course: Course, key: jax.Array, particles: int, motion: Estimate) -> Cloud:
-        """Anywhere in the corridor at any heading. Raises `ValueError` without a centre line."""
+        """Particles anywhere in the corridor. Raises `ValueError` without a centre line."""
         if course.width is None:
             raise ValueError(f"{course.name}: free walls have no corridor to draw from")
         along_key, aside_key, heading_key, key = jax.random.split(key, 4)
@@ -92,7 +92,7 @@ class PoseFilter:
     def known(
         self, pose: tuple[Scalar, Scalar, Scalar], key: jax.Array, particles: int, motion: Estimate
     ) -> Cloud:
-        """Around a pose, within 5 cm and 2°."""
+        """Particles around a pose, with standard deviations of 5 cm and 2°."""
         key, own = jax.random.split(key)
         dtype = self.walls.dtype
         spread = jax.random.normal(own, (3, particles), dtype)
@@ -111,13 +111,13 @@ class PoseFilter:
         return Cloud(x, y, heading, weight, motion, ticks, key)
 
     def update(self, memory: Cloud, sonar: tuple[Reading, ...], now: Estimate, h: Scalar) -> Cloud:
-        """The cloud after h seconds: moved with the velocity filter, weighed by what is new."""
+        """The cloud after h seconds: moved with the velocity filter, weighted by new readings."""
         key, move_key, draw_key = jax.random.split(memory.key, 3)
         x, y, heading = self.moved(memory, now, h, move_key)
         fresh = [r.tick > tick for r, tick in zip(sonar, memory.ticks, strict=True)]
         expected = self.expected(x, y, heading)
         weight = memory.weight
-        # A standing car hears the same error again and again: it is news by the distance driven.
+        # A standing car hears the same error again and again. So a ping counts by the way driven.
         speed = jnp.sqrt(now.vx**2 + now.vy**2) + 0.2 * jnp.abs(now.yaw_rate)
         news = jnp.clip(h * speed / NEWS, 0.01, 1.0)
         for reading, is_new, distance in zip(sonar, fresh, expected, strict=True):
@@ -138,7 +138,7 @@ class PoseFilter:
     def moved(
         self, memory: Cloud, now: Estimate, h: Scalar, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Each particle by the mean velocity of the step and the turn, and by what is uncertain."""
+        """The particles after a step: its mean velocity, its turn, and noise for both."""
         before, root = memory.motion, jnp.sqrt(h)
         covariance = now.velocity_covariance
         ahead, aside, turn = jax.random.normal(key, (3, len(memory.x)), memory.x.dtype)
@@ -158,12 +158,13 @@ class PoseFilter:
         )
 
     def expected(self, x: jax.Array, y: jax.Array, heading: jax.Array) -> list[jax.Array]:
-        """(particles,) for each sonar: distance of the nearest wall that returns an echo.
+        """(particles,) for each sonar: distance of the nearest wall that returns an echo, or inf.
 
-        Of each wall the nearest point within the cone counts, which is its foot where that is
-        inside, else where one of the cone's edges cuts it, and not beyond the greatest obliqueness.
-        The nearest of them is hidden by no other wall, but a wall of which only the end is in sight
-        may be by the one that it meets there, and then it does not count. No echo is infinite.
+        The nearest point of each wall within the cone counts. This is the foot of the perpendicular
+        if it is inside, else the cut with an edge of the cone. Points beyond the largest
+        obliqueness do not count. No other wall can hide the nearest of these points, except one: if
+        only the end of a wall is in sight, the wall that it meets there may hide it. A hidden point
+        does not count.
         """
         met = _met(self.walls)
         cosine, sine = jnp.cos(heading), jnp.sin(heading)
@@ -180,7 +181,7 @@ class PoseFilter:
         ]
 
     def likelihood(self, reading: Reading, expected: jax.Array) -> jax.Array:
-        """Logarithm of a reading's likelihood: a wall's, or anything's at all."""
+        """Logarithm of a reading's likelihood: of the wall, or (`MISSED`) of anything else."""
         reach = self.sonar.reach
         seen, far = jnp.isfinite(reading.value), ~(expected <= reach)
         error = jnp.where(seen & ~far, (reading.value - expected) / HIT, 0.0)
@@ -191,7 +192,7 @@ class PoseFilter:
     def resampled(
         self, x: jax.Array, y: jax.Array, heading: jax.Array, weight: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, ...]:
-        """Systematic resampling, each child a little off its parent; of equal weight."""
+        """Systematic resampling. Children are near their parents, and of equal weight."""
         start_key, rough_key = jax.random.split(key)
         count = len(x)
         total = jnp.cumsum(jnp.exp(weight))
@@ -206,9 +207,9 @@ class PoseFilter:
 
 
 def best(memory: Cloud) -> Pose:
-    """The heaviest hypothesis: what lies `NEAR` the particle with the most weight around it.
+    """The heaviest hypothesis: the particles `NEAR` the one with the most weight around it.
 
-    Among the 64 heaviest particles, the one whose surroundings weigh most is taken.
+    Only the 64 heaviest particles are candidates for its centre.
     """
     weight = jnp.exp(memory.weight)
     tops = jax.lax.top_k(memory.weight, min(64, len(weight)))[1]
@@ -223,7 +224,7 @@ def best(memory: Cloud) -> Pose:
     centre = tops[jnp.argmax(masses)]
     part = around(centre) / share
     x, y = jnp.sum(part * memory.x), jnp.sum(part * memory.y)
-    # Headings of one hypothesis differ by less than a turn, but may be whole turns apart.
+    # Headings are not wrapped: those of one hypothesis may be whole turns apart.
     off = memory.heading - memory.heading[centre]
     off = jnp.arctan2(jnp.sin(off), jnp.cos(off))
     heading = memory.heading[centre] + jnp.sum(part * off)
@@ -237,7 +238,7 @@ def best(memory: Cloud) -> Pose:
 
 @pytree
 class PoseEstimator:
-    """The pose on a course beside the velocity filter, as an `Estimator`, from a known start."""
+    """The particle filter beside the velocity filter, as an `Estimator`, from a known start."""
 
     moving: VelocityFilter
     place: PoseFilter
@@ -247,7 +248,7 @@ class PoseEstimator:
 
     @property
     def every(self) -> int:
-        """Ticks between two steps of the cloud, at least."""
+        """The least number of ticks between two steps of the cloud."""
         return max(1, round(PERIOD / self.moving.dt))
 
     def init(self, key: jax.Array) -> tuple[VelocityMemory, Located]:
@@ -279,12 +280,12 @@ class PoseEstimator:
         return moves, place
 
     def estimate(self, memory: tuple[VelocityMemory, Located]) -> Estimate:
-        """The velocity filter's, with the pose of the best hypothesis."""
+        """The velocity filter's estimate, with the pose of the best hypothesis."""
         return located(memory[1], self.moving.estimate(memory[0]))
 
 
 def located(memory: Located, now: Estimate) -> Estimate:
-    """The velocity filter's estimate with the pose put right, carried on since the last step."""
+    """The estimate `now`, with the cloud's pose moved on since the cloud's last step."""
     pose, then = memory.pose, memory.cloud.motion
     off = pose.heading - then.heading
     cosine, sine = jnp.cos(off), jnp.sin(off)
@@ -298,7 +299,7 @@ def located(memory: Located, now: Estimate) -> Estimate:
 
 
 def _met(walls: jax.Array) -> jax.Array:
-    """(2, n, 2): the way that another wall takes from each wall's ends; zeros where none does."""
+    """(2, n, 2): vector along the wall that meets each wall's start and end; zeros without."""
     starts, stops = walls[:, :2], walls[:, 2:]
     ends, others = jnp.concatenate([starts, stops]), jnp.concatenate([stops, starts])
     apart = jnp.sum((ends[:, None] - ends) ** 2, axis=-1)
@@ -315,7 +316,7 @@ def _nearest(
     y: jax.Array,
     bearing: jax.Array,
 ) -> jax.Array:
-    """(particles,): the nearest of all walls' nearest points within the cone."""
+    """(particles,): distance of the nearest point of all walls within the cone, or inf."""
     ax, ay, bx, by = (walls[:, i] - at[:, None] for i, at in enumerate((x, y, x, y)))
     length = jnp.sqrt((bx - ax) ** 2 + (by - ay) ** 2 + 1e-18)
     ux, uy = (bx - ax) / length, (by - ay) / length
@@ -334,7 +335,7 @@ def _nearest(
         high = jnp.where(change > 0, high, jnp.minimum(high, root))
     at = jnp.clip(foot, low, high)
     distance = jnp.sqrt(away**2 + (at - foot) ** 2)
-    # At an end, the wall met there hides this one if it goes off between the sonar and this one.
+    # At an end, the wall met there hides this one if it runs between the sonar and this one.
     shows = low <= high
     for end, sign, (to_x, to_y) in (
         (at <= 0.0, 1.0, (-ax, -ay)),

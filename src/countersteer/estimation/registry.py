@@ -1,4 +1,4 @@
-"""Estimators by the names that the command line has for them."""
+"""Estimators by their names on the command line."""
 
 from collections.abc import Callable
 
@@ -16,17 +16,17 @@ Make = Callable[[Course | None, Car, float], Estimator]
 
 
 def start_of(course: Course | None) -> tuple[float, float, float]:
-    """Where a car is believed to stand at first: x, y (m), heading (rad)."""
+    """The assumed start: x, y (m), heading (rad). Zeros without a course."""
     return (0.0, 0.0, 0.0) if course is None else course.start
 
 
 def velocity_filter(course: Course | None, car: Car, dt: float) -> VelocityFilter:
-    """For the nominal car at the course's start."""
+    """The velocity filter for the nominal car, at the course's start."""
     return VelocityFilter(car=car, start=start_of(course), dt=dt)
 
 
 def pose_estimator(course: Course | None, car: Car, dt: float) -> PoseEstimator:
-    """The same with a particle filter on the course's walls."""
+    """The velocity filter with a particle filter on the course's walls."""
     dtype = np.asarray(car.body.mass).dtype
     walls = padded(np.zeros((0, 4)) if course is None else course.walls, dtype)
     place = PoseFilter(walls=walls, sonar=car.sensors.sonar)

@@ -1,4 +1,4 @@
-"""The nominal car as a single track: what it does where no sensor tells."""
+"""The nominal car as a single track: its motion while no sensor reports."""
 
 import dataclasses
 from typing import NamedTuple
@@ -14,14 +14,14 @@ from countersteer.world.planar import rotated
 
 
 class Actuators(NamedTuple):
-    """What the commands so far have made of motor and servo."""
+    """State of motor and servo after the commands so far."""
 
     duty: Scalar
     steering: Scalar  # rad
 
 
 def follow(car: Car, before: Actuators, command: Command, h: Scalar) -> Actuators:
-    """After h seconds of a command; a pure delay counts as one lag more."""
+    """The state after h seconds of a command. A pure delay counts as additional lag."""
     goal = motor.duty(car.motor, command.throttle)
     slow = dataclasses.replace(car.servo, lag=car.servo.lag + car.servo.delay)
     return Actuators(
@@ -33,11 +33,11 @@ def follow(car: Car, before: Actuators, command: Command, h: Scalar) -> Actuator
 def step(
     car: Car, velocity: Vector, before: Actuators, drive: motor.Drive, friction: Scalar, h: Scalar
 ) -> Vector:
-    """The velocity h seconds later, in the axes of then, by one implicit Euler step.
+    """The velocity h seconds later, in the car's axes then, by one implicit Euler step.
 
-    Two wheels at their static loads, by their tyres' law. The rear one rolls; the front one rolls
-    too, or turns as fast as the rear one by as much as the centre is locked. The motor's torque
-    pulls up to what the tyres hold. `friction` scales the tyres' friction.
+    Both wheels bear their static loads and follow their tyres' law. The rear wheel rolls. The front
+    wheel rolls too; as far as the centre is locked, it turns as fast as the rear one. The tyres'
+    grip limits the pull of the motor. `friction` scales the tyres' friction.
     """
     body, line = car.body, car.drivetrain
     matrix = Symmetric(body.mass, body.mass, body.yaw_inertia, 0.0, 0.0, 0.0)
@@ -45,7 +45,7 @@ def step(
         body.mass * velocity.x, body.mass * velocity.y, body.yaw_inertia * velocity.yaw
     )
     behind = body.wheelbase - body.front_axle
-    dragged: Scalar = 0.0  # what the locked centre takes from the front wheel, for the rear one
+    dragged: Scalar = 0.0  # force of the locked centre on the front wheel; the rear one loses it
     for tire, arm, other, share, (cosine, sine) in (
         (car.tires.front, body.front_axle, behind, line.front_share, cosine_sine(before.steering)),
         (car.tires.rear, -behind, body.front_axle, 1 - line.front_share, (1.0, 0.0)),
@@ -60,7 +60,7 @@ def step(
         pull = share * drive.torque / tire.radius - dragged
         dragged = contact.k_x * (rim - along)
         slope = (share * drive.slope + 2 * drivetrain.drag(car, rim / tire.radius)) / tire.radius**2
-        # Beyond what the tyre holds the wheel spins or locks.
+        # Beyond the tyre's grip the wheel spins or locks.
         most = friction * tyre.limit(tire, load)
         over = jnp.minimum(1.0, most / (jnp.abs(pull - slope * along) + 1e-6))
         matrix = matrix.plus(h * contact.k_y, slide).plus(h * over * slope, roll)

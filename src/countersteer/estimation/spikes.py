@@ -1,12 +1,12 @@
-"""Spikes of a sonar told from walls, without waiting for a second reading of the wall.
+"""Separates a sonar's spikes from walls, without waiting for a second reading of a wall.
 
-A spike is shorter than any wall can be: between two pings the car comes no nearer than it drives.
-So the distance that may be believed is at least the one before, less what was driven. A reading
-below that is not taken but kept, and the next one is measured against it too: a wall that came
-into view at once (past the end of another) is believed one ping late, and that is all it costs.
-Any other wall is seen in the ping that sees it. Readings that are too long, such as of an echo that
-was lost, pass: nothing ahead is not a danger yet, and the next echo is as sound as if it had been
-the first, which is again one ping late at most.
+Between two pings the car comes no nearer to a wall than it drives. So a credible distance is at
+least the last one, less the way driven. A shorter reading is a spike.
+
+A spike is not believed but kept, and the next reading is compared with it too. So a wall that
+appears suddenly (past the end of another) is believed one ping late. That is the only cost: any
+other wall is believed at once. Readings that are too long pass, such as a lost echo: nothing ahead
+is no danger yet. The next echo then counts as a first one, and is one ping late at most.
 """
 
 from typing import NamedTuple
@@ -16,31 +16,32 @@ import numpy as np
 
 from countersteer.signals import Reading, Scalar
 
-SLACK = 4.0  # standard deviations of a reading by which it may be too short
+SLACK = 4.0  # standard deviations by which a reading may be too short
 
 
 class SpikeMemory(NamedTuple):
-    """Of one sonar."""
+    """The memory of one sonar."""
 
-    believed: Scalar  # m, less what was driven since
+    believed: Scalar  # credible distance, m, less the way driven since
     heard: Scalar  # the last reading, likewise
     tick: Scalar
 
 
 def initial_memory(dtype: np.dtype) -> SpikeMemory:
-    """Nothing heard."""
+    """Before the first reading."""
     return SpikeMemory(dtype.type(np.inf), dtype.type(np.inf), np.int32(-1))
 
 
 def update(memory: SpikeMemory, reading: Reading, driven: Scalar, noise: Scalar) -> SpikeMemory:
-    """With a reading, if it is new; `driven` is how much nearer the car came at most since (m).
+    """The memory after a reading, if it is new.
 
-    A believed distance is that of the reading, or where this is a spike, of what it had to be.
+    `driven` is the largest approach since the last call (m). The believed distance is the reading.
+    If the reading is a spike, it is the last believed distance less `driven`.
     """
     believed, heard = memory.believed - driven, memory.heard - driven
     fresh = reading.tick > memory.tick
     slack = SLACK * noise
-    # Too short for what was believed, and nothing like it was heard before.
+    # Shorter than the believed distance, and than the reading before.
     spike = reading.value < jnp.minimum(believed, heard) - slack
     taken = jnp.where(spike, believed, reading.value)
     return SpikeMemory(

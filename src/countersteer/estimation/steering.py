@@ -1,13 +1,13 @@
-"""The steering as it is felt: a Kalman filter of how far the servo turns, and of its trim.
+"""The steering: a Kalman filter of the servo's gain and trim.
 
-A servo that turns less than it should leaves less lock to catch a slide with: what decides most of
-all whether a turn can be ended. It is felt where the front tyres hold. Their side force (over their
-load, f) is known by the accelerometer, so the brush model's law turned round tells the angle
+A servo that turns too little leaves less lock to catch a slide. This matters most for whether a
+turn can be ended. The gain shows while the front tyres hold. The accelerometer gives their side
+force over their load, f. The inverse of the brush model then gives the slip angle
 
     s = 3 mu / C (1 - (1 - |f| / mu)^(1/3)) sign f
 
-between the wheels and the way that the axle takes, atan2(vy + a r, vx); the sum of the two is where
-the wheels stand.
+between the wheels and the axle's direction of motion, atan2(vy + a r, vx). The sum of the two is
+the angle of the wheels.
 """
 
 import math
@@ -18,32 +18,32 @@ import jax.numpy as jnp
 from countersteer.estimation.kalman import Covariance, correct, diagonal, predict
 from countersteer.signals import Scalar
 
-SERVOS = 0.12  # deviation of the gain at the start, over the nominal servo's
-TRIMS = math.radians(0.6)  # of the trim
-DRIFTS = 0.005  # of the gain, per root second
-EXACT = math.radians(1.0)  # standard deviation of an angle that is told,
-SLIPS = 0.25  # part of the tyres' own slip angle,
-LAGS = 0.015  # and s by which the servo is early or late
-MEMORY = 0.1  # s for which such an error stays the same
-USED = 0.8  # part of their friction up to which tyres hold
-SLOWEST = 0.8  # m/s, under which angles mean little
-GATE = 4.0
+SERVOS = 0.12  # standard deviation at the start: of the gain over the nominal servo's,
+TRIMS = math.radians(0.6)  # and of the trim
+DRIFTS = 0.005  # random walk of the gain, per root second
+EXACT = math.radians(1.0)  # standard deviation of the measured angle: a constant,
+SLIPS = 0.25  # a part of the tyres' own slip angle,
+LAGS = 0.015  # and the error of the servo's timing, s
+MEMORY = 0.1  # s, time for which such an error stays the same
+USED = 0.8  # part of their friction up to which the tyres hold
+SLOWEST = 0.8  # m/s, below which angles mean little
+GATE = 4.0  # standard deviations beyond which a measurement is rejected
 
 
 class Servo(NamedTuple):
-    """What is believed of the servo: gain over the nominal one's, and trim (rad)."""
+    """Estimate of the servo: gain over the nominal one's, and trim (rad)."""
 
     mean: tuple[Scalar, ...]
     covariance: Covariance
 
 
 def initial() -> Servo:
-    """The nominal one."""
+    """The nominal servo."""
     return Servo((1.0, 0.0), diagonal([SERVOS, TRIMS]))
 
 
 def gives(share: Scalar) -> Scalar:
-    """By how much more than in proportion a brush tyre slips at a share of its friction."""
+    """Slip of a brush tyre over that of a linear tyre, at a share of its friction."""
     share = jnp.clip(share, 0.01, 0.9)
     return 3 * (1 - jnp.cbrt(1 - share)) / share
 
@@ -61,10 +61,11 @@ def update(
     valid: Scalar,
     h: Scalar,
 ) -> Servo:
-    """After h seconds: `nominal` is where the nominal servo stands (rad) and `turning` its rate.
+    """The estimate after h seconds.
 
-    `way` is the front axle's angle to the nose (rad), `push` its side force over its load. At its
-    `limit` (rad) a servo tells no more than that it turns so far.
+    `nominal` is the angle of the nominal servo (rad), `turning` its rate.
+    `way` is the angle from the nose to the front axle's motion (rad), `push` its side force over
+    its load. A servo at its `limit` (rad) is no measurement: it shows only that it turns so far.
     """
     mean, covariance = believed
     share = jnp.abs(push) / friction

@@ -1,9 +1,10 @@
-"""Where the car is in its corridor, and at which angle: a Kalman filter on the side sonars.
+"""The car's offset and angle in its corridor: a Kalman filter on the side sonars.
 
 The states are the offset from the corridor's middle (m, to the left), the angle of the car to it
-(rad, to the left) and the gyroscope's bias. Speed and gyroscope carry them on, and so the response
-to what is steered; each side sonar tells how far its wall is. Seen over a distance driven, these
-tell the angle too, which neither sonar measures: what the heading's slow drift leaves out.
+(rad, to the left) and the gyroscope's bias (rad/s). Speed and gyroscope predict them, and so
+include the response to steering. Each side sonar measures the distance of its wall. No sonar
+measures the angle, but its readings over a distance driven do. They correct the heading's slow
+drift.
 """
 
 import dataclasses
@@ -24,17 +25,17 @@ from countersteer.signals import Reading, Scalar
 
 OFFSET, ANGLE, BIAS = range(3)
 START = (0.1, 0.05, 0.005)  # standard deviations at the start: m, rad, rad/s
-WALKS = (0.02, 0.02, 0.001)  # growth of them, per root second
-TURNING = 1.0  # rad/s of yaw rate from which on no wall is looked at: it may be a corner's
-STEEPEST = math.radians(20)  # angle to a wall beyond which it is not looked at
+WALKS = (0.02, 0.02, 0.001)  # their random walks, per root second
+TURNING = 1.0  # rad/s of yaw rate, from which sonars are ignored: a wall may be a corner's
+STEEPEST = math.radians(20)  # angle to the walls beyond which sonars are ignored
 SCANNED = math.radians(35)  # the same of a lidar's beams
-NEAREST = 0.08  # m from a wall within which no car's middle can be
-COARSE = 0.05  # m: error that a reading is credited with while the offset is hardly known
+NEAREST = 0.08  # m; the middle of a car cannot be nearer to a wall
+COARSE = 0.05  # m: additional error of a reading while the offset is hardly known
 REPEATS = 16  # equal readings after which a sonar counts as stuck
-GATE = 3.5  # standard deviations beyond which a reading is of something else than the wall
-FORGETS = 0.5  # s without a believed reading from which the offset is known less and less
-ROUNDING = 2e-5  # s, of a time in 32 bits
-CURVES = 0.03  # rad/m: deviation of the walls' bend in what the rooms call a straight
+GATE = 3.5  # standard deviations beyond which a reading is not of the wall
+FORGETS = 0.5  # s without an accepted reading, after which the offset's variance grows
+ROUNDING = 2e-5  # s, rounding error of a time in 32 bits
+CURVES = 0.03  # rad/m: standard deviation of the walls' curvature on a nominal straight
 
 
 class WallAngleMemory(NamedTuple):
@@ -44,18 +45,18 @@ class WallAngleMemory(NamedTuple):
     covariance: Covariance
     time: Scalar
     heading: Scalar  # the velocity filter's, at that time
-    believed: Scalar  # time of the last reading that was believed
-    last: tuple[Scalar, ...]  # reading of each side sonar, m
-    repeats: tuple[Scalar, ...]  # of it in a row
+    believed: Scalar  # time of the last accepted reading
+    last: tuple[Scalar, ...]  # last reading of each side sonar, m
+    repeats: tuple[Scalar, ...]  # equal readings in a row before it
 
     @property
     def offset(self) -> Scalar:
-        """From the corridor's middle, to the left (m)."""
+        """Offset from the corridor's middle, to the left (m)."""
         return self.mean[OFFSET]
 
     @property
     def angle(self) -> Scalar:
-        """Of the car to the corridor, to the left (rad)."""
+        """Angle of the car to the corridor, to the left (rad)."""
         return self.mean[ANGLE]
 
     @property
@@ -83,7 +84,7 @@ class WallAngle:
     resolution: Scalar
     mounts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     sides: tuple[float, ...] = dataclasses.field(metadata={"static": True})
-    lidar: Lidar | None = None  # where the car has one, its beams tell too
+    lidar: Lidar | None = None  # if the car has one, its beams are used too
 
     def initial_memory(
         self,
@@ -102,7 +103,7 @@ class WallAngle:
     def turned(
         self, memory: WallAngleMemory, angle: Scalar, doubt: Scalar = 0.03
     ) -> WallAngleMemory:
-        """The corridor beyond a corner of this angle: nothing is known of the offset there.
+        """The memory in the corridor after a corner of this angle; its offset is unknown.
 
         `doubt` is what the corner adds to the angle's standard deviation (rad).
         """
@@ -122,10 +123,10 @@ class WallAngle:
         scan: Reading | Any | None = None,
         scan_age: Scalar = math.inf,
     ) -> WallAngleMemory:
-        """With what the sonars have that is new: those readings whose age (s) is under a step's.
+        """The memory after the new readings: those whose age (s) is less than the step.
 
-        A side's distance d is that to where its beam meets the wall nearest, so that
-        side (w/2 - d) = offset + x sin(angle) + y cos(angle) while the wall is within the cone.
+        A sonar at (x, y) measures the distance d of the nearest point of its wall. So
+        side (w/2 - d) = offset + x sin(angle) + y cos(angle), if that point is within the cone.
         """
         h = time - memory.time
         turned = estimate.heading - memory.heading
@@ -164,7 +165,7 @@ class WallAngle:
                 self.noise**2 + self.resolution**2 / 12 + jnp.where(vague, COARSE**2, 1e-8),
                 fresh
                 & (repeats[i] < REPEATS)
-                & (jnp.abs(seen) < self.width / 2 - NEAREST)  # false of inf and NaN too
+                & (jnp.abs(seen) < self.width / 2 - NEAREST)  # false for inf and NaN too
                 & (jnp.abs(mean[ANGLE]) < STEEPEST)
                 & (jnp.abs(estimate.yaw_rate) < TURNING),
                 GATE,
@@ -181,7 +182,7 @@ class WallAngle:
                 GATE,
             )
             believed = jnp.where(accepted, time, believed)
-        # Long without a believed reading: rather believe too little than shut them all out.
+        # Long without an accepted reading: raise the variance, so that not all are rejected.
         lost = jnp.where(time - believed > FORGETS, (0.3 * self.width) ** 2 * h, 0.0)
         covariance = predict(covariance, {}, {OFFSET: lost})
         return WallAngleMemory(
@@ -190,7 +191,7 @@ class WallAngle:
 
 
 def wall_angle(car: Car, width: float) -> WallAngle:
-    """For the nominal car's sonars that look to a side, within 30° of square."""
+    """The filter for the nominal car's sonars that look to a side, within 30° of square."""
     sonar = car.sensors.sonar
     found = [
         (number, math.copysign(1.0, float(mount.angle)), mount)

@@ -1,6 +1,6 @@
-"""The paper's measurements, one a file: a table, a picture and a paragraph of figures each.
+"""The paper's measurements, one in each file. Each gives a table, a picture and a paragraph.
 
-A module has `simulate(car, name, report)`, and `measure(runs)` where run folders can tell it too.
+A module has `simulate(car, name, report)`. It also has `measure(runs)` if run folders suffice.
 """
 
 import importlib

@@ -1,7 +1,7 @@
-"""The same commands at four charges and three wears: what a battery makes of them.
+"""The effect of the battery: the same commands at four charges and three wears.
 
-A second straight at a throttle, a turn to the left by wheels and throttle, wheels back without
-throttle; or the commands of a run.
+The commands are a second straight ahead at a throttle, a left turn with throttle, and countersteer
+without throttle; or else those of a run.
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ from countersteer.runs.run import Run, drawn_car
 from countersteer.task.turns import sideslip
 
 CHARGES, WEARS = (1.0, 0.75, 0.5, 0.25), (0.0, 0.5, 1.0)
-# Time (s), throttle, part of the full lock.
+# Time (s), throttle, part of full lock
 STEPS = ((0.0, 0.9, 0.0), (1.0, 0.8, 0.8), (1.35, 0.0, -0.8), (1.65, 0.0, 0.0))
 DRIVE = 2.2  # s
 LONGEST = 10.0  # s of a run's commands
 
 
 def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Result:
-    """From rest, on open floor."""
+    """Simulate the commands from rest, on open floor."""
     lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
     driver = commands(*((t, u, lock * part) for t, u, part in STEPS))
     return _found(car, name, driver, DRIVE, STEPS[1][0], report, lanes)
 
 
 def measure(runs: Sequence[Run]) -> Result:
-    """The commands of a run, with its car."""
+    """Simulate the commands of the first run with its car, for at most `LONGEST`."""
     told, car = runs[0].commands, drawn_car(runs[0].about)
     driver = Replay(times=told["time_s"], throttle=told["throttle"], steering=told["steering"])
     longest = min(float(told["time_s"][-1]), LONGEST)

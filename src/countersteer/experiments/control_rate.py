@@ -1,9 +1,9 @@
-"""10 Hz over a lossy radio against 1000 Hz on board, open loop against closed, two batteries.
+"""10 Hz over a lossy radio or 1000 Hz on board, open or closed loop, two batteries.
 
-The paper's own argument. One corner of 90°, cars drawn around the nominal one, a full new pack or
-one that is worn and nearly flat. Open loop means that the commands of a turn are those which the
-closed loop gave in it with the nominal car and the first battery, played back from the place at
-which the driver hands over; before and after, the closed loop drives.
+This is the paper's own argument. Cars drawn around the nominal one drive a corner of 90°. The
+battery is full and new, or worn and nearly empty. The open loop plays back the commands of a turn
+that the closed loop gave with the nominal car and the first battery. Playback begins where the
+driver hands over. Before and after it, the closed loop drives.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from countersteer.task.judge import Outcome, Score
 
 TRIALS = 256
 SPEED = 2.0  # m/s
-AFTER = 0.2  # s for which they go on once the car goes straight
+AFTER = 0.2  # s of recorded commands after the car goes straight
 LONGEST = 8.0  # s of a trial
 BATTERIES = {"first": (1.0, 0.0), "last": (0.3, 1.0)}  # charge, wear
 
@@ -45,7 +45,7 @@ def corner(width: float = 1.4, name: str = "corner") -> Course:
 
 
 def record(course: Course, car: Car, driver: DriftTurn) -> tuple[np.ndarray, np.ndarray]:
-    """Throttle and steering of the turn with the nominal car and the first battery."""
+    """Throttle and steering of the turn, by the nominal car with the first battery."""
     simulator = Simulator.of(course, jax.tree.map(np.float32, car))
     drive = simulator.record(Pilot.of(driver, course, car), LONGEST)
     turning = np.nonzero(drive.status.turn > 0)[0]
@@ -63,7 +63,7 @@ def record(course: Course, car: Car, driver: DriftTurn) -> tuple[np.ndarray, np.
 def simulate(
     car: Car, name: str, report: Report = silent, trials: int = TRIALS, lanes: int = LANES
 ) -> Result:
-    """Eight cells of trials: rate, loop, battery."""
+    """Simulate eight cells of trials: rate, loop, battery."""
     course = corner()
     closed = drift_turn(course, car, SPEED)
     throttle, steering = record(course, car, closed)
@@ -91,7 +91,7 @@ def simulate(
 
 
 class Cell(NamedTuple):
-    """One set of trials."""
+    """The conditions of one set of trials."""
 
     link: str
     loop: str  # open or closed
@@ -99,7 +99,7 @@ class Cell(NamedTuple):
 
 
 def run_cell(course: Course, car: Car, driver: Any, cell: Cell, trials: int, lanes: int) -> Score:
-    """Its trials."""
+    """Run the trials of a cell."""
     charge, wear = BATTERIES[cell.battery]
     population = dataclasses.replace(load_population("around"), charge=(charge, charge))
     drawn = draw(population, car, course, range(trials), np.float32)
@@ -119,7 +119,7 @@ def run_cell(course: Course, car: Car, driver: Any, cell: Cell, trials: int, lan
 
 
 def row(cell: Cell, score: Score) -> dict[str, Any]:
-    """What came of a cell, as a row of the table."""
+    """The results of a cell, as a row of the table."""
     won = score.outcome == Outcome.REACHED.code
     ended = np.isfinite(score.turns.end[:, 0])
     error = np.degrees(score.turns.error[ended, 0])
@@ -171,7 +171,7 @@ def _paint(
     errors: dict[Cell, np.ndarray],
     figure: Any,
 ) -> None:
-    """Corners passed, and heading errors, by cell."""
+    """Draw corners passed, and heading errors, by cell."""
     left, right = figure.subplots(1, 2)
     rates = {"onboard": "1000 Hz on board", "radio": "10 Hz by radio"}
     labels = [f"{rates[c.link]}\n{c.loop} loop, {c.battery} battery" for c in errors]

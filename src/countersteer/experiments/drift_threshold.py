@@ -1,8 +1,8 @@
-"""Straight ahead, then wheels over without throttle: from which energy on the car drifts.
+"""The least energy of a drift: straight ahead, then wheels over without throttle.
 
-Drifting is a sideslip of more than 25°. The kinetic energy is m v² / 2 as the wheels turn over. In
-a log such a moment is one at which the wheels turn by more than 5° while nothing is asked of the
-motor, from a tenth of a second before to half a second after.
+A drift is a sideslip of more than 25°. The kinetic energy is m v² / 2 when the wheels turn over.
+In a log, this is a step of the commanded steering by at least 5°. The throttle is off from 0.1 s
+before it to 0.5 s after it.
 """
 
 import math
@@ -28,7 +28,7 @@ OVER = math.radians(5)
 
 
 def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Result:
-    """Four locks at 37 speeds, to the left."""
+    """Simulate four locks at 37 speeds, to the left."""
     full = float(car.servo.limit_left)
     lock, speed = (grid.ravel() for grid in np.meshgrid(LOCKS, SPEEDS, indexing="ij"))
     drivers = [commands((0.0, 0.0, 0.0), (0.1, 0.0, angle)) for angle in full * lock]
@@ -46,7 +46,7 @@ def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -
 
 
 def measure(runs: Sequence[Run]) -> Result:
-    """Moments of logs; needs motion capture, as nothing else tells sideslip."""
+    """Find such steps in logs. They need motion capture, since nothing else gives sideslip."""
     rows = []
     for run in runs:
         series = series_of(run)
@@ -124,7 +124,7 @@ def _found(car: Car, name: str, lock: np.ndarray, speed: np.ndarray, peak: np.nd
 
 
 def _threshold(of: dict[str, Any]) -> str:
-    """In words."""
+    """A threshold in words."""
     if of["energy_j"] is None:
         return f"{of['lock_deg']:.0f}°: never"
     return f"{of['lock_deg']:.0f}°: from {of['energy_j']:.1f} J ({of['speed_mps']:.2f} m/s)"

@@ -1,7 +1,7 @@
-"""One drift turn in all its signals: a simulated one, or one that a log holds.
+"""One drift turn in all its signals: simulated, or from a log.
 
-Simulated: the drift-turn driver, on its sensors, round a right corner of 90°. In a log: the first
-turn that was stopped, from a second before its kill.
+Simulated: the drift-turn driver, on its sensors, in a right corner of 90°. From a log: the first
+turn that was stopped, from a second before its kill (the end of its throttle).
 """
 
 import math
@@ -22,11 +22,11 @@ from countersteer.runs.run import Run
 from countersteer.simulator import Simulator
 from countersteer.task.turns import sideslip
 
-BEFORE, BEHIND = 1.0, 0.8  # s about the kill that are shown
+BEFORE, BEHIND = 1.0, 0.8  # s shown before the kill, and after the stop
 
 
 def simulate(car: Car, name: str, report: Report = silent) -> Result:
-    """The nominal car with a full battery, at 2 m/s."""
+    """Simulate the nominal car with a full battery, at 2 m/s."""
     course = corner()
     simulator = Simulator.of(course, jax.tree.map(np.float32, car))
     drive = simulator.record(Pilot.of(drift_turn(course, car, SPEED), course, car), LONGEST)
@@ -54,7 +54,7 @@ def simulate(car: Car, name: str, report: Report = silent) -> Result:
 
 
 def measure(runs: Sequence[Run]) -> Result:
-    """The first turn that was stopped in these runs."""
+    """The first turn in these runs that was stopped. Raises `InputError` if there is none."""
     for run in runs:
         series = series_of(run)
         if stops(series, undisturbed=False):

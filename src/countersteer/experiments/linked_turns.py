@@ -1,9 +1,9 @@
 """Four turns of 90° linked without straightening, with and without carrying errors over.
 
-On open floor, on the sensors of cars drawn around the nominal one: each turn begins as soon as the
-one before is stopped. Carried over, a turn's error is part of the next one's target; else each
-turn counts from the heading at which it begins. There are no walls to look at, so the gyroscope's
-drift and the heading at the start are in both.
+Cars drawn around the nominal one drive on their sensors, on open floor. Each turn begins as soon as
+the one before has stopped. With carrying, a turn's error is part of the next target. Without it,
+each turn counts from the heading at its start. The sensors see no walls. So both results include
+the gyroscope's drift and the heading at the start.
 """
 
 import dataclasses
@@ -32,24 +32,24 @@ FAR = 1e4  # m
 
 
 class Kept(NamedTuple):
-    """Of a trial: how its last turn goes."""
+    """The progress of a trial's last turn."""
 
     stirred: Scalar  # 1 once the car has not gone straight in it
     calm_since: Scalar  # s
-    heading: Scalar  # rad, once the car has gone straight for 50 ms behind it; NaN before
+    heading: Scalar  # rad, once the car has gone straight for 50 ms after it; NaN before
 
 
 @pytree
 class LastTurn:
-    """Looks at the heading behind the driver's last turn: no corridor tells where it ends."""
+    """Records the heading after the driver's last turn. No corridor marks the turn's end."""
 
     def begin(self, now: Instant) -> Kept:
-        """Nothing yet."""
+        """An empty record."""
         zero = jnp.zeros_like(now.simulator.world.motion(now.loop.state).x)
         return Kept(zero, zero, zero + jnp.nan)
 
     def look(self, now: Instant, kept: Kept) -> Kept:
-        """One instant more."""
+        """The record with one more instant."""
         motion = now.simulator.world.motion(now.loop.state)
         time = now.simulator.dt * now.loop.tick.astype(motion.x.dtype)
         turns, calm = now.pilot.status(now.memory).turn >= TURNS, goes_straight(motion)
@@ -60,12 +60,12 @@ class LastTurn:
         return Kept(stirred, since, heading)
 
     def end(self, kept: Kept) -> Kept:
-        """All of it."""
+        """The whole record."""
         return kept
 
 
 def open_floor(angle: float = ANGLE) -> Course:
-    """A line without walls, and turns that nothing but the driver brings about."""
+    """A line without walls, and turns that only the driver makes."""
     line = np.array([[0.0, 0.0], [FAR, 0.0]])
     turns = tuple(Turn(float(n), angle) for n in range(1, TURNS + 1))
     none = np.zeros((0, 4))
@@ -73,7 +73,7 @@ def open_floor(angle: float = ANGLE) -> Course:
 
 
 def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS) -> Result:
-    """Over random cars; the heading's error is that at the end of the last turn."""
+    """Simulate random cars. The error is that of the heading at the end of the last turn."""
     course, seeds = open_floor(), range(trials)
     drawn = draw(load_population("around"), car, course, seeds, np.float32)
     errors = {}
@@ -119,7 +119,7 @@ def simulate(car: Car, name: str, report: Report = silent, trials: int = TRIALS)
 
 
 def _figures(errors: np.ndarray) -> dict[str, float]:
-    """Of the trials whose last turn ended."""
+    """Statistics of the trials whose last turn ended."""
     values = errors[np.isfinite(errors)]
     return {
         "ended": len(values),

@@ -1,10 +1,9 @@
-"""Linear regression in regions: a line over x in each region of v, and how many the data carry.
+"""Linear regression in regions: a line over x in each region of v.
 
 The bounds of k regions are those of least squares (by dynamic programming over quantiles of v).
-How many there are is chosen by cross-validation: the fewest whose squared error, predicted for
-turns that were held out, is within one standard error of the least (Hastie, Tibshirani and
-Friedman, The Elements of Statistical Learning, 7.10). What is predicted, is predicted as it will be
-used: with the lines interpolated between the regions' medians of v.
+Cross-validation chooses k. It is the smallest k whose squared error on held-out turns is within one
+standard error of the least (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning,
+7.10). Predictions interpolate the lines between the regions' medians of v, as in later use.
 """
 
 import math
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-LEAST = 15  # points that carry a line
+LEAST = 15  # fewest points for a line
 MOST = 6  # regions
 CUTS = 24  # quantiles of v at which a bound may lie
 FOLDS = 10
@@ -35,7 +34,7 @@ class Line(NamedTuple):
 
 
 class Local(NamedTuple):
-    """The chosen regions, and what was known when they were."""
+    """The chosen regions, and the errors behind the choice."""
 
     lines: tuple[Line, ...]
     error: dict[int, float]  # cross-validated rms of y, by number of regions
@@ -43,7 +42,7 @@ class Local(NamedTuple):
 
 
 def fit(v: np.ndarray, x: np.ndarray, y: np.ndarray) -> Local:
-    """Regions and lines. Needs `LEAST` points or more, in any order."""
+    """Choose regions and fit their lines. Needs `LEAST` points or more, in any order."""
     fold = np.random.default_rng(0).permutation(len(v)) % FOLDS
     most = min(MOST, len(v) // LEAST)
     error, deviation = {}, {}
@@ -65,7 +64,7 @@ def fit(v: np.ndarray, x: np.ndarray, y: np.ndarray) -> Local:
 
 
 def bounds_of(local: Local) -> list[float]:
-    """Speeds between the regions."""
+    """The speeds between the regions."""
     return [line.low for line in local.lines[1:]]
 
 
@@ -100,7 +99,7 @@ def regress(v: np.ndarray, x: np.ndarray, y: np.ndarray, bounds: list[float]) ->
 
 
 def predicted(lines: tuple[Line, ...], v: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """y, with the lines interpolated between the regions' middles."""
+    """The prediction of y by the lines, interpolated between the regions' middles."""
     middles = [line.middle for line in lines]
     offset = np.interp(v, middles, [line.offset for line in lines])
     slope = np.interp(v, middles, [line.slope for line in lines])
@@ -108,7 +107,7 @@ def predicted(lines: tuple[Line, ...], v: np.ndarray, x: np.ndarray) -> np.ndarr
 
 
 def _bounds(v: np.ndarray, x: np.ndarray, y: np.ndarray, count: int) -> list[float] | None:
-    """Between `count` regions, where the sum of squares is least; None where there are too few."""
+    """The bounds of `count` regions with the least sum of squares; None for too few points."""
     order = np.argsort(v, kind="stable")
     v, x, y = v[order], x[order], y[order]
     cuts = np.unique(np.round(np.linspace(0, len(v), CUTS + 1)).astype(int))
@@ -123,7 +122,7 @@ def _bounds(v: np.ndarray, x: np.ndarray, y: np.ndarray, count: int) -> list[flo
         return max(syy - sy * sy / n - (sxy - sx * sy / n) ** 2 / spread, 0.0)
 
     ends = range(len(cuts))
-    least = {0: (0.0, [0])}  # by the last cut: cost, and the cuts until there
+    least = {0: (0.0, [0])}  # by the last cut: cost, and the cuts so far
     for _ in range(count):
         step: dict[int, tuple[float, list[int]]] = {}
         for b in ends[1:]:
@@ -138,7 +137,7 @@ def _bounds(v: np.ndarray, x: np.ndarray, y: np.ndarray, count: int) -> list[flo
 
 
 def in_regions(lines: Sequence[Line], v: np.ndarray) -> np.ndarray:
-    """The number of each point's region."""
+    """The index of each point's region."""
     return np.searchsorted([line.low for line in lines[1:]], v, side="right")
 
 
@@ -151,9 +150,9 @@ def paint_stops(
     times: np.ndarray,
     angles: np.ndarray,
 ) -> None:
-    """Time and angle to the stop over the yaw rate, a colour and a line a region.
+    """Draw time and angle to the stop over the yaw rate, with a colour and a line for each region.
 
-    SI units and rad; drawn in degrees.
+    Arguments are in SI units and rad, the drawing is in degrees.
     """
     import matplotlib
 

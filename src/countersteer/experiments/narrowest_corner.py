@@ -1,13 +1,12 @@
 """The narrowest 90° corner that a car passes, and the time through it: by grip, and by drift.
 
-A law's numbers are drawn some hundred times for each width (the same draws at every width), and a
-width is passed when any draw gets through without a touch: what is compared is what the two ways
-can do when they are told everything, not how well a driver senses. Both begin 1.2 m before the
-corner at their speed, and are through when the car is 1.2 m behind it, within 30° of the corridor.
+The parameters of a law are drawn `DRAWS` times, with the same draws at every width. A width is
+passed if any draw gets through without a touch. So the comparison is between the two ways with full
+knowledge, not between drivers on sensors. Both begin 1.2 m before the corner at their speed. They
+are through when the car is 1.2 m behind it, within 30° of the corridor.
 
-By grip: wheels over by one angle, back again so that the car comes out straight, at one speed; the
-rear axle never slips by more than 12°. By drift: the laws of drift-turn over a gap, with sideslip
-of over 25°.
+By grip: wheels over by one angle, then back, so that the car leaves straight, at one speed. The
+rear slip angle stays below 12°. By drift: the laws of drift-turn, with a sideslip of over 25°.
 """
 
 import dataclasses
@@ -32,29 +31,30 @@ from countersteer.experiments.result import Report, Result, silent
 DRAWS = 512
 GATE = 1.2  # m before and behind the corner
 WIDEST, RESOLUTION = 2.0, 0.01  # m
-WIDTHS = (0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.4)  # m, at which times are compared
-WAYS = {False: "grip", True: "drift"}  # by whether the car slides
+WIDTHS = (0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.4)  # m, of compared times
+WAYS = {False: "grip", True: "drift"}  # True: the car slides
 LINED_UP = math.radians(30)
 GRIP_SLIP = math.radians(12)
 LONGEST = 4.5  # s
 MARGIN = 0.03  # m from the outer wall at the start
-# Ends of what is drawn: speed (m/s), part of the free room towards the outer wall, distance of the
-# turning-in from the corner (m), and how far the wheels go or the law's numbers are scaled.
+# Ranges of the draws: speed (m/s), part of the free room towards the outer wall, distance from the
+# turn-in to the corner (m), part of full lock (by drift: factor of the yaw rate), and throttle in a
+# drift as a part of its range.
 GRIP = ((0.6, 2.6), (0.0, 1.0), (-0.4, 1.0), (0.3, 1.0), (0.0, 1.0))
 SLIDE = ((1.2, 3.0), (0.0, 1.0), (-0.4, 1.15), (0.7, 1.6), (0.0, 1.0))
 
 
 class Tried(NamedTuple):
-    """What came of the draws at a width; times are NaN for those that did not pass."""
+    """The results of the draws at a width; times are NaN for draws that did not pass."""
 
     time: np.ndarray
     entry_speed: np.ndarray
     peak_sideslip: np.ndarray
-    track: np.ndarray  # (3, samples) x, y, heading of the fastest; empty where none passed
+    track: np.ndarray  # (3, samples) x, y, heading of the fastest; empty if none passed
 
 
 def attempt(car: Car, width: float, slides: bool, draws: int, lanes: int) -> Tried:
-    """All draws of one law at one width."""
+    """Drive all draws of one law at one width."""
     segments = [("straight", 3.0, 0.0), ("turn", math.pi / 2, 0.0), ("straight", 3.0, 0.0)]
     course = from_segments("corner", width, False, segments)
     ends = np.array(SLIDE if slides else GRIP)
@@ -106,7 +106,7 @@ def attempt(car: Car, width: float, slides: bool, draws: int, lanes: int) -> Tri
         & (np.abs(m.heading[rows, at] - math.pi / 2) < LINED_UP)
         & ((peak > DRIFT) if slides else (slid < GRIP_SLIP))
     )
-    # Between two samples the car moves by some millimetres: the gate is crossed in between.
+    # The car moves some millimetres between two samples. So the time at the gate is interpolated.
     earlier = np.maximum(at - 1, 0)
     part = (GATE - m.y[rows, earlier]) / np.maximum(m.y[rows, at] - m.y[rows, earlier], 1e-9)
     time = sampled.time[earlier] + np.clip(part, 0, 1) * (sampled.time[at] - sampled.time[earlier])
@@ -119,18 +119,18 @@ def attempt(car: Car, width: float, slides: bool, draws: int, lanes: int) -> Tri
 
 
 def _scaled(turning: Turning, factor: float) -> Turning:
-    """The laws with the yaw rate that is held scaled, for corners tighter or wider."""
+    """The laws with their held yaw rate scaled, for tighter or wider corners."""
     return dataclasses.replace(turning, rate=factor * turning.rate)
 
 
 def simulate(
     car: Car, name: str, report: Report = silent, draws: int = DRAWS, lanes: int = LANES
 ) -> Result:
-    """Bisection for the narrowest width of either law, and times over a range of widths."""
+    """Find the narrowest width of both laws by bisection, and times over a range of widths."""
     tried, narrowest = search(car, report, draws, lanes)
     order = sorted(tried)
     best = {key: _best(tried[key]) for key in order}
-    # What gets through a narrow corridor gets through a wider one with the same middle.
+    # A drive through a narrow corridor is also one through a wider corridor of the same middle.
     fastest = {
         (s, w): float(
             np.nanmin([best[key][0] for key in order if key[0] == s and key[1] <= w] + [np.inf])
@@ -178,7 +178,7 @@ def simulate(
 def search(
     car: Car, report: Report, draws: int, lanes: int
 ) -> tuple[dict[tuple[bool, float], Tried], dict[bool, float]]:
-    """What came of each width that was tried, and the narrowest passed (NaN: none), by way."""
+    """The results at each tried width, and the narrowest width passed (NaN: none), by way."""
     low, high = float(car.body.width), WIDEST
     halvings = math.ceil(math.log2((high - low) / RESOLUTION))
     steps = 2 * (halvings + len(WIDTHS) + 1)
@@ -243,7 +243,7 @@ def _paint(
     tracks: dict[bool, np.ndarray],
     figure: Any,
 ) -> None:
-    """Times over width, and both ways through their narrowest corner."""
+    """Draw times over width, and both ways through their narrowest corner."""
     left, *maps = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
     for ax, (slides, way), colour in zip(maps, WAYS.items(), ("tab:blue", "tab:red"), strict=True):
         mine = [(w, t) for (s, w), t in fastest.items() if s == slides and math.isfinite(t)]
@@ -273,7 +273,7 @@ def _best(tried: Tried) -> tuple[float, float, float]:
 
 
 def _draw_track(ax: Any, car: Car, width: float, track: np.ndarray) -> None:
-    """The corner with the car's outline every tenth of a second."""
+    """Draw the corner with the car's outline every tenth of a second."""
     half = width / 2
     for sign in (1, -1):
         ax.plot([1.5, 3.0 - sign * half, 3.0 - sign * half], [sign * half] * 2 + [1.6], "k", lw=1)

@@ -1,8 +1,8 @@
-"""Turns in the open: how long, and by what angle, a car still turns once it is stopped.
+"""Turns on open floor: the time and the angle that a car still turns after it is stopped.
 
-A turn is stopped when its throttle is killed. What is measured is the yaw rate and the speed then,
-and what follows until the yaw rate is about nothing. The same measurement is made of simulated
-turns (`trial`) and of a real car's logs (`of_run`).
+A turn is stopped by its kill, the end of its throttle. Yaw rate and speed are measured at the kill,
+then time and angle until the yaw rate is nearly 0. The measurement is the same for simulated turns
+(`trial`) and for logs of a real car (`of_run`).
 """
 
 import math
@@ -23,17 +23,17 @@ from countersteer.runs.run import Run, drawn_car, read_run
 from countersteer.task.turns import sideslip
 from countersteer.tuning.windows import find_references, read_measured
 
-ON, OFF = 0.05, 0.02  # throttle that drives, and throttle that does not
-FAST = 1.0  # rad/s from which a car turns
-BEGIN = 0.3  # rad/s at which a turn has begun
-STILL = 0.1  # rad/s at which it has stopped
-LONGEST = 2.0  # s that stopping may take
-SLOWEST = 0.3  # m/s: slower ones tell nothing of a drift
+ON, OFF = 0.05, 0.02  # throttle that drives (above), and throttle that does not (up to)
+FAST = 1.0  # rad/s; above it, a car turns
+BEGIN = 0.3  # rad/s at the start of a turn
+STILL = 0.1  # rad/s at its end
+LONGEST = 2.0  # s, longest stop
+SLOWEST = 0.3  # m/s; slower turns say nothing about a drift
 SAMPLE = 0.005  # s between samples of a log
 
 RUN_TIME = 3.2  # s of a simulated trial: run-up, turn, stop
-KILL = (1.0, 1.5)  # kill yaw rates: from so many rad/s to so much of the rate that is held
-SPIN = (0.25, 0.75)  # s after which the throttle is killed whatever the yaw rate
+KILL = (1.0, 1.5)  # range of the kill yaw rate: rad/s, and factor of the held yaw rate
+SPIN = (0.25, 0.75)  # s, range of the longest time until the kill, at any yaw rate
 
 COLUMNS = (
     "hand",
@@ -52,31 +52,31 @@ WORDS = ("hand", "run")
 
 
 class Series(NamedTuple):
-    """A drive as samples; NaN where nothing is known. SI units, rad."""
+    """A drive as samples; NaN where unknown. SI units, rad."""
 
     time: np.ndarray
     throttle: np.ndarray
     steering: np.ndarray
     vx: np.ndarray
-    vy: np.ndarray  # NaN where only wheels and a gyroscope tell
+    vy: np.ndarray  # NaN if wheels and gyroscope are the only sources
     yaw_rate: np.ndarray
 
 
 class Stop(NamedTuple):
     """A turn that was stopped. SI units, rad."""
 
-    hand: int
+    hand: int  # 1 left, -1 right
     time: float  # of the kill
     entry_speed: float
-    vx: float  # at the kill: what an encoder would tell
-    yaw_rate: float  # at the kill, in the turn's hand
+    vx: float  # at the kill, as an encoder measures it
+    yaw_rate: float  # at the kill, positive in the turn's direction
     duration: float
     angle: float
-    peak_sideslip: float  # NaN where nothing tells it
+    peak_sideslip: float  # NaN: unknown
 
 
 def stops(series: Series, undisturbed: bool = True) -> list[Stop]:
-    """The turns that were stopped, and came to a stop: `undisturbed` by throttle until then."""
+    """The turns with a kill and then a stop; if `undisturbed`, without throttle in between."""
     time, rate = series.time, series.yaw_rate
     drives = series.throttle > ON
     held = np.abs(series.throttle) <= OFF
@@ -147,10 +147,10 @@ def trial(
     report: Callable[[int, int], None] = lambda *_: None,
     lanes: int = 128,
 ) -> list[list[Any]]:
-    """One turn for each seed, as rows; those that do not come to a stop in time are left out.
+    """Simulate one turn for each seed, as rows. Turns that do not stop in time are left out.
 
-    Hand, speed of entry, yaw rate at the kill and charge are drawn by the seed; so is the car,
-    where there is a population. The driver knows the nominal car.
+    The seed draws the hand, entry speed, yaw rate and latest time of the kill, and the charge. With
+    a population, it also draws the car. The driver knows the nominal car.
     """
     count = len(seeds)
     cars, charges, floor = repeated(car, count), np.ones(count), None
@@ -190,9 +190,9 @@ def trial(
 
 
 def series_of(run: Run) -> Series:
-    """A run's drive: motion capture or the simulated truth, else gyroscope and wheel speed.
+    """The series of a run: motion capture or the simulated truth, else gyroscope and wheel speed.
 
-    A sensor's lag is taken off. Raises `InputError` where neither is there.
+    The lag of sensors is removed. Raises `InputError` if the run has neither.
     """
     found = find_references(read_measured(run, drawn_car(run.about)))
     forward = found.get("vx_mps") or found.get("wheel_speed_mps")
@@ -217,14 +217,14 @@ def series_of(run: Run) -> Series:
 
 
 def of_run(path: Path) -> list[list[Any]]:
-    """The turns of a run's folder that were stopped, as rows."""
+    """The stopped turns of a run's folder, as rows."""
     run = read_run(path)
     charge = float(run.about.get("battery_charge", math.nan))
     return [row(stop, charge, run=path.name) for stop in stops(series_of(run))]
 
 
 def write_rows(path: Path, rows: Sequence[Sequence[Any]]) -> None:
-    """The table as `turns.csv`; an empty cell is not known."""
+    """Write the rows as `turns.csv`. An unknown value is an empty cell."""
     lines = [",".join(COLUMNS)]
     lines += [",".join(_cell(value) for value in one) for one in rows]
     path.write_text("\n".join(lines) + "\n")
@@ -248,9 +248,9 @@ def as_table(rows: Sequence[Sequence[Any]]) -> Table:
 
 
 def read_turns(path: Path) -> Table:
-    """Turns from a `turns.csv`, a folder that holds one, or a run's folder.
+    """Read turns from a `turns.csv`, a folder that holds one, or a run's folder.
 
-    Raises `InputError` where a number is missing or is none that a stop can have.
+    Raises `InputError` if a number is missing or impossible for a stop.
     """
     if path.is_dir() and (path / "run.toml").exists():
         return as_table(of_run(path))
@@ -271,7 +271,7 @@ def read_turns(path: Path) -> Table:
 
 
 def draw_turns(table: Table, path: Path, title: str) -> None:
-    """A picture: time and angle to the stop over the yaw rate at the kill, by speed."""
+    """Draw time and angle to the stop over the yaw rate at the kill, coloured by speed."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -305,7 +305,7 @@ def draw_turns(table: Table, path: Path, title: str) -> None:
 
 
 def summary(table: Table, tried: int | None) -> dict[str, Any]:
-    """What the table holds, in figures; names and units are those of the JSON."""
+    """Statistics of the table; names and units are those of the JSON."""
     count = len(table["hand"])
     result: dict[str, Any] = {"turns": count}
     if tried is not None:

@@ -1,4 +1,4 @@
-"""What an experiment finds, and its files."""
+"""The result of an experiment, and its files."""
 
 import json
 import math
@@ -12,21 +12,21 @@ Report = Callable[[int, int], None]
 
 
 def silent(done: int, of: int) -> None:
-    """Reports to nobody."""
+    """Ignore progress."""
 
 
 class Result(NamedTuple):
-    """A table (columns by name, with units), figures for JSON, a paragraph, a picture."""
+    """A table (columns by name, with units), figures for JSON, a paragraph and a picture."""
 
     table: Mapping[str, Sequence[Any] | np.ndarray]
     figures: dict[str, Any]
     text: str
-    draw: Callable[[Any], None]  # on a matplotlib figure
+    draw: Callable[[Any], None]  # draws on a matplotlib figure
     size: tuple[float, float] = (10.0, 4.0)  # inches
 
 
 def write(found: Result, folder: Path, name: str) -> dict[str, Any]:
-    """Write NAME.csv, NAME.png and summary.json; returns what the last holds."""
+    """Write NAME.csv, NAME.png and summary.json. Returns the content of summary.json."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -47,7 +47,7 @@ def write(found: Result, folder: Path, name: str) -> dict[str, Any]:
 
 
 def _cell(value: Any) -> str:
-    """A number to six digits, none for NaN, or a word."""
+    """A number with six digits, an empty cell for NaN, or a word."""
     if isinstance(value, str):
         return value
     number = float(value)

@@ -1,8 +1,8 @@
-"""Turns that were stopped: lines through time and angle over the yaw rate, in regions of speed.
+"""Stopped turns: lines through time and angle over the yaw rate, in regions of speed.
 
-The paper's local linear regression. Beyond some sideslip the wheels turned back no longer stop a
-car, and it spins on until it stands: no line holds there, and such turns are left out by the angle
-that they took.
+This is the paper's local linear regression. Beyond some sideslip, countersteer no longer stops a
+car, and it spins on until it stands. No line fits such turns. They are recognised by their angle
+and left out.
 """
 
 import math
@@ -24,11 +24,11 @@ from countersteer.experiments.local_regression import (
 )
 from countersteer.runs.files import Table
 
-MOST = math.radians(30)  # that a turn may go on for, where the lines shall be straight
+MOST = math.radians(30)  # largest angle to the stop for which the lines are straight
 
 
 class Stops(NamedTuple):
-    """The regression and what it was made from. SI units, rad."""
+    """The regression and its data. SI units, rad."""
 
     angle: Local
     time: tuple[Line, ...]  # in the regions of the angle
@@ -36,13 +36,13 @@ class Stops(NamedTuple):
     rate: np.ndarray
     angles: np.ndarray
     times: np.ndarray
-    most: float  # that a turn may have gone on for
-    ran_on: int  # turns left out
-    ran_on_from: float  # least yaw rate at which one ran on
+    most: float  # largest angle of the turns used
+    ran_on: int  # number of turns left out
+    ran_on_from: float  # least yaw rate of a turn left out
 
     @property
     def stop_angle(self) -> StopAngle:
-        """What the driver asks."""
+        """The regression in the form that the driver uses."""
         column = lambda name: np.array([getattr(line, name) for line in self.angle.lines])  # noqa: E731  # used four times
         return StopAngle(
             speeds=column("middle"),
@@ -53,7 +53,10 @@ class Stops(NamedTuple):
 
 
 def regress_stops(table: Table, most: float = MOST) -> Stops:
-    """Regions and lines from a table of turns. Raises `InputError` where they carry no line."""
+    """Fit regions and lines to a table of turns. Raises `InputError` if it has too few for a line.
+
+    `most` (rad) is the largest angle to the stop of a turn that is used.
+    """
     angle = np.radians(table["angle_to_stop_deg"])
     rate = np.radians(table["kill_yaw_rate_degps"])
     stopped = angle <= most
@@ -78,7 +81,7 @@ def regress_stops(table: Table, most: float = MOST) -> Stops:
 
 
 def about(found: Stops) -> dict[str, Any]:
-    """The regression in figures; names and units are those of the JSON."""
+    """The figures of the regression; names and units are those of the JSON."""
     regions = [
         {
             "speed_mps": [angle.low, angle.high],
@@ -117,7 +120,7 @@ def about(found: Stops) -> dict[str, Any]:
 
 
 def lines(told: dict[str, Any]) -> list[str]:
-    """The same for a person."""
+    """The figures of `about` as lines for a person."""
     errors = told["cross_validated_rms_deg"]
     text = [
         f"{told['turns']} turns, {len(told['regions'])} regions by {told['chosen_by']} (rms "
@@ -142,7 +145,7 @@ def lines(told: dict[str, Any]) -> list[str]:
 
 
 def paint(found: Stops, figure: Any) -> None:
-    """The turns with the lines through them, by region."""
+    """Draw the turns and their lines, by region."""
     paint_stops(
         figure,
         found.time,
@@ -155,7 +158,7 @@ def paint(found: Stops, figure: Any) -> None:
 
 
 def draw(found: Stops, path: Path, title: str) -> None:
-    """Picture of the same."""
+    """Write the picture of `paint` to `path`."""
     import matplotlib
 
     matplotlib.use("Agg")

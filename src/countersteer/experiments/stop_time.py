@@ -1,4 +1,4 @@
-"""Time and angle until a turn is stopped, over the yaw rate at the kill, with the regression."""
+"""Time and angle from the kill of a turn to its stop, over the yaw rate, with the regression."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ TRIALS, SPEEDS, CHARGE = 1000, (1.0, 3.0), (0.3, 1.0)
 def simulate(
     car: Car, name: str, report: Report = silent, trials: int = TRIALS, lanes: int = LANES
 ) -> Result:
-    """Turns in the open with the laws of the library's policy, as `trials turns` drives them."""
+    """Simulate turns on open floor with the laws of the library's policy, as `trials turns`."""
     rows = trial(
         car, library().turning, None, range(trials), SPEEDS, CHARGE, report=report, lanes=lanes
     )
@@ -27,7 +27,7 @@ def simulate(
 
 
 def measure(runs: Sequence[Run]) -> Result:
-    """The turns of logs that were stopped."""
+    """The stopped turns of logs."""
     rows = [row for run in runs for row in of_run(run.path)]
     return _found(as_table(rows), f"{len(runs)} runs")
 

@@ -1,4 +1,4 @@
-"""Trials: commands for a series of drives that the simulator and a real car run alike."""
+"""Throttle steps: commands for a series of drives, the same for the simulator and a real car."""
 
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,12 @@ from countersteer.runs.files import COMMANDS, TableWriter, command_rows
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # throttle: the paper's ten
 DURATION = 1.0  # s, the paper's
-REST = 1.0  # s of no throttle behind a step: the car rolls out, and its drag can be told
+REST = 1.0  # s without throttle after a step: the car rolls out and shows its drag
 RATE = 100.0  # Hz
 
 
 def read_levels(text: str) -> tuple[float, ...]:
-    """Levels of throttle from `0.1,0.2,…`. Raises `InputError`."""
+    """Levels of throttle from `0.1,0.2,…`. Raises `InputError` if one is invalid or there twice."""
     try:
         levels = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -38,9 +38,9 @@ def throttle_steps(
 ) -> dict[str, Any]:
     """Write a `commands.csv` for each level: that throttle from rest, then none; wheels straight.
 
-    A row comes every 1/`rate` seconds, `duration` seconds (a whole number of rows) at the level and
-    `REST` seconds at 0. Returns the files in the order in which to run them, and writes the same
-    for a person in `README.txt`.
+    A row comes every 1/`rate` seconds: for `duration` seconds (rounded to whole rows) at the level,
+    then for `REST` seconds at 0. Returns the files in the order of the runs. `README.txt` holds
+    the same for a person.
     """
     on, off = round(duration * rate), round(REST * rate)
     if on < 1:
@@ -63,7 +63,7 @@ def throttle_steps(
 
 
 def _instructions(runs: list[dict[str, Any]], duration: float) -> str:
-    """What to do with the files."""
+    """Instructions for the files."""
     names = "\n".join(f"  {Path(run['commands']).name}" for run in runs)
     return f"""Throttle steps: {len(runs)} runs from rest, straight, {duration:g} s at a throttle.
 

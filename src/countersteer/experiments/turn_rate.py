@@ -1,11 +1,10 @@
-"""Yaw rate over the wheels' angle where nothing slips.
+"""Yaw rate over the wheels' angle without slip.
 
-Simulated: wheels held at an angle, at speeds that grip holds; the last half second counts. In a
-log: stretches of half a second in which the commanded angle stands still, the yaw rate too, and the
-rear axle slips by less than 3°, as far as that is known. Without slip the yaw rate is
-v tan(angle) / L; the line through yaw rate / v over tan(angle) tells L as it is felt, which is
-longer than the wheelbase where the front wheels slip more than the rear ones, or turn by less than
-they were asked.
+Simulated: wheels held at an angle, at speeds within grip; the last half second counts. From a log:
+half seconds with a constant commanded angle, a constant yaw rate, and a rear slip angle below 3°,
+where it is known. Without slip the yaw rate is v tan(angle) / L. The line through yaw rate / v over
+tan(angle) gives L, the effective wheelbase. It is longer than the wheelbase if the front wheels
+slip more than the rear ones, or turn less than commanded.
 """
 
 import math
@@ -25,15 +24,15 @@ from countersteer.runs.run import Run, drawn_car
 
 SPEEDS = (0.5, 0.8, 1.1)  # m/s
 STEP = math.radians(2)
-DRIVE, COUNTS = 2.5, 0.5  # s of a drive, and of its end that counts
-GRIPS = math.radians(3)  # rear slip angle
-STILL = math.radians(0.5)  # by which a standing angle may change
-EVEN = 0.15  # rad/s: deviation of a standing yaw rate
-GENTLE = 1.5  # m/s² across, where nothing tells of slip
+DRIVE, COUNTS = 2.5, 0.5  # s, length of a drive, and of its end that counts
+GRIPS = math.radians(3)  # rear slip angle; below it, the car does not slip
+STILL = math.radians(0.5)  # largest change of a constant angle
+EVEN = 0.15  # rad/s, largest standard deviation of a constant yaw rate
+GENTLE = 1.5  # m/s², largest lateral acceleration without slip, if the slip angle is unknown
 
 
 def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -> Result:
-    """Every second degree of lock at three speeds."""
+    """Simulate every second degree of lock at three speeds."""
     left, right = float(car.servo.limit_left), float(car.servo.limit_right)
     angles = STEP * np.arange(-math.floor(right / STEP + 1e-6), math.floor(left / STEP + 1e-6) + 1)
     speeds, asked = (grid.ravel() for grid in np.meshgrid(SPEEDS, angles, indexing="ij"))
@@ -54,7 +53,7 @@ def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -
 
 
 def measure(runs: Sequence[Run]) -> Result:
-    """Stretches of logs."""
+    """Find such half seconds in logs."""
     rows: list[tuple[float, ...]] = []
     for run in runs:
         series = series_of(run)

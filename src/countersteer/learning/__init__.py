@@ -1,1 +1,1 @@
-"""Learning: from experience to a driver's numbers."""
+"""Learning of a driver's parameters from drives."""

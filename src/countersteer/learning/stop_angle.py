@@ -1,4 +1,4 @@
-"""How far a car still turns once it is stopped, learned from turns that were stopped."""
+"""The angle that a car still turns after the kill of a turn, learned from stopped turns."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,21 +12,21 @@ from countersteer.runs.files import Table
 
 
 def learn(sources: Sequence[Path], most: float, out: Path) -> Stops:
-    """Learn from tables of turns or runs, and write the policy; `most` as in `regress_stops`."""
+    """Learn from tables of turns or runs, and write the policy. `most` is as in `regress_stops`."""
     found = regress_stops(read_all(sources), most)
     save_policy(out, source(found, [path.name for path in sources]), stop_angle=found.stop_angle)
     return found
 
 
 def read_all(paths: Sequence[Path]) -> Table:
-    """The turns of several tables or runs, one below the other."""
+    """The turns of several tables or runs in one table."""
     tables = [read_turns(path) for path in paths]
     names = ("kill_speed_mps", "kill_yaw_rate_degps", "time_to_stop_s", "angle_to_stop_deg")
     return Table({name: np.concatenate([table[name] for table in tables]) for name in names})
 
 
 def source(found: Stops, names: Sequence[str]) -> dict[str, str]:
-    """What the policy says of where its numbers are from."""
+    """The source of the numbers, as the policy states it."""
     told = about(found)
     errors = "; ".join(
         f"{r['middle_mps']:.2f} m/s: offset ± {r['angle']['offset_error_deg']:.2g}°, slope ± "

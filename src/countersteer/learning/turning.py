@@ -1,10 +1,10 @@
-"""The numbers of a turn, learned by driving: a cross-entropy search over random cars.
+"""The parameters of a turn, learned by driving: a cross-entropy search over random cars.
 
-A generation of candidates is drawn about a mean, each number by itself; each candidate drives the
-same trials, in one batch; the best quarter, weighted by rank, moves the mean and the spread.
+A generation of candidates is drawn around a mean, each number independently. All candidates drive
+the same trials, in one batch. The best quarter, weighted by rank, moves the mean and the spread.
 
-Source of the method: R. Y. Rubinstein, Methodology and Computing in Applied Probability 1, 1999;
-the weights are those of CMA-ES (N. Hansen, 2016).
+Source of the method: R. Y. Rubinstein, Methodology and Computing in Applied Probability 1, 1999.
+The weights are those of CMA-ES (N. Hansen, 2016).
 """
 
 import dataclasses
@@ -23,9 +23,9 @@ from countersteer.drivers.policy import TABLES, Policy
 from countersteer.pilot import Pilot
 from countersteer.task.judge import Outcome, Score
 
-SPEEDS = (1.5, 2.0, 2.5, 3.0)  # m/s asked for, by turns
-SLOWEST = 1.1  # m/s: a trial that takes longer is lost
-# Spread that a search begins with, in the units used inside; what is not here stays as it is.
+SPEEDS = (1.5, 2.0, 2.5, 3.0)  # m/s asked of the driver, one trial after another
+SLOWEST = 1.1  # m/s, mean speed; a slower trial is out of time
+# First spread of a search, in the units used inside. Numbers that are not here are not searched.
 SPREAD = {
     "offset": 0.05,
     "slope": 0.03,
@@ -49,12 +49,12 @@ SPREAD = {
     "stop_servo": 0.8,
     "aim_servo": 0.5,
 }
-KEEPS, STAYS = 0.35, 0.75  # of the mean, and of the spread, from one generation to the next
-WANTED, LEAST, MOST = 37.0, 28.0, 48.0  # degrees of sideslip
+KEEPS, STAYS = 0.35, 0.75  # weights of the old mean and the old spread in the new ones
+WANTED, LEAST, MOST = 37.0, 28.0, 48.0  # degrees of peak sideslip: aim, least and largest
 
 
 class Generation(NamedTuple):
-    """What a generation came to: of its mean, and of its best candidate."""
+    """The result of a generation: of its mean, and of its best candidate."""
 
     cost: float
     success_rate: float
@@ -62,7 +62,7 @@ class Generation(NamedTuple):
 
 
 def cost(score: Score) -> np.ndarray:
-    """Of each trial: failure, sideslip that is missing or too much, and heading errors squared."""
+    """The cost of each trial: failure, too little or too much sideslip, squared heading errors."""
     turns, won = score.turns, score.outcome == Outcome.REACHED.code
     ended = np.isfinite(turns.end)
     done = ended.sum(axis=1)
@@ -88,9 +88,10 @@ def search(
     seed: int = 0,
     report: Callable[[int, Generation], None] = lambda *_: None,
 ) -> Policy:
-    """The policy that it ends at, from one to begin with; each generation drives one course.
+    """The policy after all generations, from the policy `begin` on.
 
-    `spread` is over `SPREAD`. Trials take the seeds from 1000 + `seed` on, others each generation.
+    Each generation drives one course, with new seeds. They count from 1000 + `seed` on. `spread` is
+    the first spread over `SPREAD`.
     """
     rng, mean = np.random.default_rng(seed), flat(begin)
     deviation = spread * np.concatenate(
@@ -122,7 +123,7 @@ def drive(
     policies: Sequence[Policy],
     seeds: Sequence[int],
 ) -> Score:
-    """Every policy over the same trials: as many trials for the first policy, then the next."""
+    """The scores of all policies in the same trials: those of the first policy, then the next."""
     drawn = draw(population, car, course, seeds, np.float32)
     plain = {speed: drift_turn(course, car, speed) for speed in SPEEDS}
     drivers = [
@@ -139,7 +140,7 @@ def drive(
 
 
 def _numbers(policy: Policy) -> list[tuple[str, Any]]:
-    """The numbers that are searched, by name, in an order of their own."""
+    """The searched numbers by name, in a fixed order."""
     return [
         (name, getattr(getattr(policy, part), name))
         for part, (_, entries) in TABLES.items()
@@ -149,12 +150,12 @@ def _numbers(policy: Policy) -> list[tuple[str, Any]]:
 
 
 def flat(policy: Policy) -> np.ndarray:
-    """All of them in a row."""
+    """All searched numbers in one array."""
     return np.concatenate([np.ravel(value) for _, value in _numbers(policy)])
 
 
 def shaped(like: Policy, numbers: np.ndarray) -> Policy:
-    """The inverse of `flat`; what is not searched is that of `like`."""
+    """The inverse of `flat`. Numbers that are not searched are those of `like`."""
     parts, first = {}, 0
     for part, (_, entries) in TABLES.items():
         table, changes = getattr(like, part), {}

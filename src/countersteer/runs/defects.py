@@ -40,11 +40,11 @@ IMPACT_RATE = 50.0  # Hz; at a lower rate, a single vibration looks like a hit
 QUIET = 6.0  # standard deviations of an accelerometer's noise that are added to the limit
 
 # Stuck sensors
-HELD, HELD_ALONE = 0.5, 1.0  # s of a constant reading: with other evidence of motion, and without
+HELD, HELD_ALONE = 0.5, 1.0  # s of a constant reading, by how strong the evidence of motion is
 READINGS = 5  # fewest readings: equal ones in a row, or ones beyond a limit
 APART = 0.5  # m/s between wheels and car; slip within grip and turning explain less
 TURNS = 0.7  # rad/s off the true yaw rate; a working gyroscope is closer
-DRIVEN, FULL = 0.1, 0.5  # throttle above every dead zone: with motion capture, and without
+DRIVEN, FULL = 0.1, 0.5  # throttle that surely moves a car: confirmed by another sensor, or alone
 STEERED = math.radians(5)  # rad; so much steering, or change of it, turns a moving car
 
 # Units
@@ -336,7 +336,7 @@ def follow(truth: Table) -> Track | None:
 
 
 def hardest(run: Run) -> float:
-    """Largest acceleration by the tyres (m/s²): `MARGIN` g times their peak friction.
+    """Largest acceleration by the tyres (m/s²): `MARGIN` · friction · `GRAVITY`.
 
     The friction is that of the run's car if known, and at least `BEST_FRICTION`.
     """
@@ -348,7 +348,7 @@ def hardest(run: Run) -> float:
 
 
 def collisions(run: Run, track: Track | None) -> Iterator[LogDefect]:
-    """Stretches in which the velocity changes by more than `hardest` over the track's span."""
+    """Stretches whose mean acceleration over the track's span is beyond `hardest`."""
     if track is None:
         return
     time = track.time

@@ -1,4 +1,4 @@
-"""Tables in files: CSV columns as arrays, read strictly and written so that they round-trip."""
+"""Tables in CSV files: columns as arrays, read strictly and written so that they round-trip."""
 
 import csv
 import logging
@@ -19,20 +19,19 @@ LARGEST_STEERING = 90.0  # degrees
 
 
 class Table(dict[str, np.ndarray]):
-    """Columns by name, all of one length; `time_s` rises."""
+    """Columns by name, all of one length; `time_s` never falls."""
 
     def __len__(self) -> int:
-        """Rows."""
+        """The number of rows."""
         return len(next(iter(self.values()))) if self.keys() else 0
 
 
 def read_table(path: Path, required: Iterable[str], text: Sequence[str] = ()) -> Table:
-    """A CSV file with a header as columns of numbers; empty cells are NaN.
+    """Read a CSV file with a header as columns of numbers; empty cells are NaN.
 
-    Columns named in `text` stay as they are. The table ends before a last line that was cut off
-    in the middle (a process that was killed), and a warning is logged. Raises `InputError` with
-    the line where the file is not what it should be: no header, missing columns, no number, a time
-    that goes backwards.
+    Columns named in `text` stay text. A last line that was cut off, by a killed process, is left
+    out with a logged warning. Raises `InputError` if a column is missing or appears twice; and,
+    with the line, for a wrong number of cells, a cell that is no number, or a falling time.
     """
     content = read_text(path)
     lines = content.splitlines()
@@ -76,12 +75,12 @@ def read_table(path: Path, required: Iterable[str], text: Sequence[str] = ()) ->
 
 
 def _first(where: np.ndarray) -> int:
-    """Line of the file that holds the first row for which this is true."""
+    """The line in the file of the first row for which `where` is true."""
     return int(np.argmax(where)) + 2
 
 
 def read_commands(path: Path) -> Table:
-    """A `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad)."""
+    """Read a `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad)."""
     table = read_table(path, COMMANDS, text=("direction",))
     for name in table:
         if name not in COMMANDS:
@@ -122,22 +121,22 @@ def column_rows(columns: Iterable[np.ndarray]) -> list[list[str]]:
 
 
 def _cell(value: float) -> str:
-    """The shortest text that reads back as the same number; none for NaN."""
+    """The shortest text that reads back as the same number; empty for NaN."""
     return "" if value != value else repr(value).removesuffix(".0")
 
 
 class TableWriter:
-    """Writes a CSV file piece by piece; what was flushed stays readable whatever comes."""
+    """Writes a CSV file piece by piece. Flushed rows stay readable after a crash."""
 
     def __init__(self, path: Path, header: Sequence[str]) -> None:
-        """Opens the file anew and writes its header."""
+        """Create or overwrite the file, and write its header."""
         self._path = path
         self._file: TextIO = path.open("w", newline="")
         self._file.write(",".join(header) + "\n")
         self._file.flush()
 
     def write(self, rows: Iterable[Sequence[str]]) -> None:
-        """Appends rows and hands them to the operating system."""
+        """Append rows and pass them to the operating system."""
         try:
             self._file.write("".join(",".join(row) + "\n" for row in rows))
             self._file.flush()
@@ -145,18 +144,18 @@ class TableWriter:
             raise OSError(error.errno, error.strerror, str(self._path)) from None
 
     def close(self) -> None:
-        """Ends the file."""
+        """Close the file."""
         self._file.close()
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """A whole table at once."""
+    """Write a whole table at once."""
     writer = TableWriter(path, list(columns))
     writer.write(column_rows(columns.values()))
     writer.close()
 
 
 def require(place: Callable[[int], str], good: np.ndarray, message: str) -> None:
-    """Raise `InputError` at the first row that is not good; `place` says where that row is."""
+    """Raise `InputError` for the first row that is not good; `place` gives the row's place."""
     if not np.all(good):
         raise InputError(f"{place(int(np.argmin(good)))}: {message}")

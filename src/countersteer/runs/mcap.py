@@ -3,18 +3,18 @@
 | topic | schema | content |
 | --- | --- | --- |
 | `/commands`, `/telemetry`, `/truth` | JSON | a message for each row of the table of that name |
-| `/motion` | JSON | speed, sideslip and yaw rate as one looks at them, from the truth |
+| `/motion` | JSON | speed, sideslip and yaw rate in display units, from the truth |
 | `/tf` | foxglove.FrameTransforms | `world` → `car` → four wheels, one frame for each sonar |
-| `/pose`, `/path` | foxglove.PoseInFrame, PosesInFrame | where the car is, and was so far |
-| `/course`, `/car` | foxglove.SceneUpdate | walls as lines; the car, fixed to its frames; once |
+| `/pose`, `/path` | foxglove.PoseInFrame, PosesInFrame | the car's pose, and its path so far |
+| `/course`, `/car` | foxglove.SceneUpdate | once: walls as lines; the car, fixed to its frames |
 | `/sonar/<mount>` | foxglove.LaserScan | each reading of a sonar as an arc over its cone |
 | `/lidar` | foxglove.LaserScan | each reading of a lidar, its beams evenly over its field |
 
-A message of a table has the table's columns, with the very digits of the CSV file. A column is
-absent where its cell is empty. JSON has no word for infinity, so no echo is the number 1e999, which
-reads as infinity wherever numbers are doubles.
+A message of a table has the table's columns, with the same digits as the CSV file. A column with an
+empty cell is left out. JSON has no infinity. So a missing echo is the number 1e999, which reads as
+infinity where numbers are doubles.
 
-Log times are nanoseconds since time 0 of the run, which stands at the start of 1970.
+Log times are nanoseconds since time 0 of the run. Time 0 is the start of 1970.
 
 Schemas: https://docs.foxglove.dev/docs/visualization/message-schemas/introduction
 """
@@ -33,9 +33,9 @@ from countersteer.car.car import Car, wheel_positions
 from countersteer.runs.run import drawn_car
 
 POSE_PERIOD = 0.01  # s between two poses, at least
-PATH_PERIOD = 0.5  # s between two pictures of the whole path
-MOST_PATH = 500  # poses in one
-BEAMS = 9  # by which the arc of a sonar's reading is drawn
+PATH_PERIOD = 0.5  # s between two messages of the whole path, at least
+MOST_PATH = 500  # poses in such a message
+BEAMS = 9  # of the arc that shows a sonar's reading
 POSE = ("time_s", "x_m", "y_m", "heading_rad")
 VELOCITY = ("vx_mps", "vy_mps", "yaw_rate_radps")
 MOTION = ("time_s", "speed_mps", "sideslip_deg", "yaw_rate_degps")
@@ -48,18 +48,19 @@ WALL, BODY, CABIN, TIRE = (
 )
 LEVEL = messages.Quaternion(w=1.0)
 
-Cells = Sequence[Sequence[str]]  # rows of a table as they stand in its CSV file
+Cells = Sequence[Sequence[str]]  # rows of a table, as in its CSV file
 
 
 class McapWriter:
-    """Writes `run.mcap` piece by piece; after each piece the file reads, were it cut off there."""
+    """Writes `run.mcap` piece by piece. The file is readable up to the last whole piece."""
 
     def __init__(
         self, path: Path, about: Mapping[str, Any], text: str, tables: Mapping[str, Sequence[str]]
     ) -> None:
-        """Opens the file anew, with `text` (that of `run.toml`, `about`) as an attachment.
+        """Create or overwrite the file. `text` is that of `run.toml`, and is attached to the file.
 
-        `tables` gives the headers by name. Raises `OSError` as writing may, later on too.
+        `about` is its content. `tables` gives the headers by name. This method and all later ones
+        raise `OSError` if the file cannot be written.
         """
         self._path = path
         self._file = _File(path)
@@ -67,7 +68,7 @@ class McapWriter:
         self._writer = foxglove.open_mcap(
             self._file,
             context=context,
-            # Without seeking a chunk reaches the file whole: no length is filled in later on.
+            # Without seeking, a chunk is written whole. No length is filled in later.
             writer_options=MCAPWriteOptions(disable_seeking=True, compression_threads=0),
         )
         self._writer.attach(
@@ -86,7 +87,7 @@ class McapWriter:
         self._flush()
 
     def write(self, tables: Mapping[str, Cells]) -> None:
-        """Appends rows by table, none earlier than what was written before."""
+        """Append rows by table. No row may be earlier than those of the calls before."""
         what = [
             message
             for name, rows in tables.items()
@@ -99,7 +100,7 @@ class McapWriter:
         self._flush()
 
     def close(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Ends the file with its index, and with the summary where there is one."""
+        """End the file with its index, and with the summary if there is one."""
         if summary is not None:
             self._writer.write_metadata("summary", {"summary.json": json.dumps(summary)})
         self._writer.close()
@@ -107,7 +108,7 @@ class McapWriter:
         self._check()
 
     def _flush(self) -> None:
-        """Ends the chunk and hands it to the operating system."""
+        """End the chunk and pass it to the operating system."""
         self._writer.flush()
         self._check()
 
@@ -117,7 +118,7 @@ class McapWriter:
 
 
 class _File:
-    """A file that only grows and keeps its first error, as the library would only print it."""
+    """An append-only file that keeps its first error, since the library would only print it."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")
@@ -130,7 +131,7 @@ class _File:
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Where the end is: the library asks for nothing else."""
+        """The position of the end. The library asks for no other position."""
         del offset, whence
         return self._position
 
@@ -178,7 +179,7 @@ class _TableChannel:
 
 
 class _Scene:
-    """What the 3D panel draws: made from the rows of the tables."""
+    """The messages for the 3D panel, made from the rows of the tables."""
 
     def __init__(
         self,
@@ -261,7 +262,7 @@ class _Scene:
                 self._hubs, self._radii, (steering, steering, 0.0, 0.0), strict=True
             )
         ]
-        # All frames each time, so that a viewer finds them wherever in the run it begins.
+        # All frames each time, so that a viewer can begin anywhere in the run.
         frames = [
             messages.FrameTransform(
                 timestamp=stamp,
@@ -290,7 +291,7 @@ class _Scene:
 def _scan(
     time: float, frame: str, log: Callable[..., None], ranges: list[float], half: float
 ) -> Timed:
-    """Distances evenly over so much (rad) to either side of a frame's x axis, right to left."""
+    """A scan of `ranges` (m), evenly from `half` (rad) right of a frame's x axis to `half` left."""
     scan = messages.LaserScan(
         timestamp=timestamp(time),
         frame_id=frame,
@@ -304,7 +305,7 @@ def _scan(
 
 
 def _course(walls: Sequence[Sequence[float]]) -> messages.SceneEntity:
-    """The walls (ends x, y, x, y) as lines on the floor."""
+    """The walls (x, y, x, y of their ends) as lines on the floor."""
     points = [
         messages.Point3(x=float(x), y=float(y)) for wall in walls for x, y in (wall[:2], wall[2:])
     ]
@@ -352,15 +353,15 @@ def _car(car: Car) -> list[messages.SceneEntity]:
 
 
 def nanoseconds(time: float) -> int:
-    """Log time of a moment of the run (s)."""
+    """The log time of a time of the run (s)."""
     return round(time * 1e9)
 
 
 def timestamp(time: float) -> messages.Timestamp:
-    """The same as messages carry it."""
+    """The log time in the form that messages need."""
     return messages.Timestamp(*divmod(nanoseconds(time), 10**9))
 
 
 def turned_by(angle: float) -> messages.Quaternion:
-    """A rotation about the vertical."""
+    """A rotation about the vertical by `angle` (rad)."""
     return messages.Quaternion(z=math.sin(angle / 2), w=math.cos(angle / 2))

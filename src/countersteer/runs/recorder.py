@@ -1,4 +1,4 @@
-"""Writes a run's folder while the drive goes on: simulated, imported or real."""
+"""Writes a run's folder during the drive, which is simulated, imported or real."""
 
 import itertools
 import json
@@ -18,32 +18,32 @@ from countersteer.text import toml_of
 
 
 class Pace(NamedTuple):
-    """How often what is recorded, in ticks of `dt` seconds."""
+    """Recording periods of the tables, in ticks of `dt` seconds."""
 
     dt: float
     telemetry: int
     truth: int
-    onboard: bool  # then each reading has a row of its own tick
+    onboard: bool  # True: each reading has a row at its own tick
 
 
 class Frames(NamedTuple):
-    """What passed between pilot and car at some instants: arrays with an axis of instants in front.
+    """Readings and commands between pilot and car; arrays have a leading axis of instants.
 
-    A real car's recorder feeds one at a time, a simulation half a second.
+    A real car's recorder feeds one instant at a time, a simulation half a second.
     """
 
     tick: np.ndarray
-    readings: Readings  # the sensors' last reports then
-    command: Command  # that the car runs from then on
-    fresh: np.ndarray  # whether it is a new one
-    truth: tuple[np.ndarray, ...] | None = None  # values of `TRUTH`; None where nothing tells
+    readings: Readings  # last reports of the sensors
+    command: Command  # of the car from this instant on
+    fresh: np.ndarray  # True for a new command
+    truth: tuple[np.ndarray, ...] | None = None  # values of `TRUTH`; None: unknown
 
 
 def new_folder(out: Path | None, name: str) -> Path:
-    """An empty folder for a run. Without `out`, a numbered one under `runs/`.
+    """Make an empty folder for a run: `out`, or else a numbered one under `runs/`.
 
-    A run that is there already is kept: it is moved aside to a name with the next free number.
-    Raises `InputError` where the folder holds something that is no run.
+    An existing run is kept under another name, with the next free number. Raises `InputError` if
+    the folder holds something other than a run, or if it cannot be made.
     """
     if out is None:
         return _numbered(Path("runs"), name)
@@ -60,7 +60,7 @@ def new_folder(out: Path | None, name: str) -> Path:
 
 
 def _numbered(parent: Path, name: str) -> Path:
-    """A folder of the first free number; two drives at once get two."""
+    """Make the folder with the first free number. Simultaneous drives get different folders."""
     number = 1
     while True:
         folder = parent / f"{name}-{number:03d}"
@@ -74,15 +74,15 @@ def _numbered(parent: Path, name: str) -> Path:
 
 
 def _due(tick: np.ndarray, before: np.ndarray, every: int) -> np.ndarray:
-    """Where a multiple of so many ticks has been reached since the frame before."""
+    """True where a multiple of `every` ticks was reached since the frame before."""
     due: np.ndarray = tick // every > before // every
     return due
 
 
 class Recorder:
-    """A folder with `run.toml`, tables that grow, and `run.mcap`; flushed with every piece.
+    """Writes `run.toml`, growing tables and `run.mcap` to a folder, flushed with every piece.
 
-    It takes frames (`record`), or whole tables as an importer has them (`write`).
+    It takes frames (`record`), or whole tables from an importer (`write`).
     """
 
     def __init__(
@@ -93,13 +93,14 @@ class Recorder:
         channels: Readings | None = None,
         pace: Pace | None = None,
     ) -> None:
-        """Writes `run.toml` and the headers of the tables, by their names.
+        """Write `run.toml` and the `headers` of the tables, by name.
 
-        Frames need the `channels` of the car's sensors and the `pace`, and bring their headers.
+        Frames need the `channels` of the car's sensors and the `pace`. Their headers follow from
+        the channels.
         """
         self.folder = folder
         self._channels, self._pace = channels, pace
-        self._last = self._newest = self._told = -1  # ticks: frame, reading, row of telemetry
+        self._last = self._newest = self._told = -1  # last ticks: frame, reading, telemetry row
         if channels is not None:
             told = [column for channel in flat(channels) for column in channel.columns]
             truth = ("time_s", *(channel.name for channel in TRUTH))
@@ -114,7 +115,7 @@ class Recorder:
         self._summary: dict[str, Any] | None = None
 
     def record(self, frames: Frames) -> None:
-        """Appends frames: rows of all three tables."""
+        """Append frames as rows of all three tables."""
         assert self._channels is not None, "frames need channels"
         assert self._pace is not None, "frames need a pace"
         pace, tick = self._pace, np.asarray(frames.tick)
@@ -138,7 +139,7 @@ class Recorder:
         if len(rows):
             self._told = int(tick[rows[-1]])
         command = [np.asarray(part) for part in frames.command]
-        # A command that is no number is none that a car can run.
+        # A car cannot run a command of NaN.
         fresh = np.nonzero(np.asarray(frames.fresh) & np.isfinite(command[0] + command[1]))[0]
         tables = {
             "commands": tuple(part[fresh] for part in (time, *command)),
@@ -151,7 +152,7 @@ class Recorder:
         self.write(tables)
 
     def write(self, tables: Mapping[str, Sequence[np.ndarray]]) -> None:
-        """Appends a piece: columns by table, in the order of its header.
+        """Append a piece: columns by table, in the order of its header.
 
         `commands` is time, throttle (negative in reverse) and steering (rad); NaN is an empty cell.
         """
@@ -163,7 +164,7 @@ class Recorder:
         self._mcap.write(cells)
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Writes `summary.json`."""
+        """Write `summary.json`."""
         self._summary = summary
         (self.folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
 

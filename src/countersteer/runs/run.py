@@ -17,7 +17,7 @@ from countersteer.text import read_text, tables_of
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A drive of a simulated or a real car. Tables that are not there are None."""
+    """A drive of a simulated or a real car. Missing tables are None."""
 
     path: Path
     about: dict[str, Any]  # run.toml
@@ -28,7 +28,7 @@ class Run:
 
     @property
     def car(self) -> Car | None:
-        """The car that drove, where it was simulated."""
+        """The car of a simulated drive, else None."""
         tables = self.about.get("car")
         return (
             car_from_tables(tables, f"{self.path}/run.toml") if isinstance(tables, dict) else None
@@ -36,15 +36,16 @@ class Run:
 
     @property
     def walls(self) -> np.ndarray:
-        """(n, 4) ends of the course's walls, m."""
+        """Ends (x, y, x, y) of the course's walls (m): (n, 4)."""
         walls = self.about.get("course", {}).get("walls_m", [])
         return np.array(walls, float).reshape(-1, 4)
 
 
 def drawn_car(about: Mapping[str, Any]) -> Car:
-    """The car to draw for a `run.toml`: its own in full, else the library's of that name or rx7.
+    """The car of a `run.toml`: its own in full, else the library's of that name, else rx7.
 
-    What is drawn needs a size; nothing is computed with a car that is only like the real one.
+    The latter two may differ from the real car. Drawing needs only a size, but `measure` of the
+    experiments computes with the car too.
     """
     if isinstance(about.get("car"), dict):
         return car_from_tables(about["car"], "run.toml")
@@ -53,7 +54,7 @@ def drawn_car(about: Mapping[str, Any]) -> Car:
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """A `summary.json`. Raises `InputError` where it is none."""
+    """Read a `summary.json`. Raises `InputError` if it is not one."""
     try:
         found = json.loads(read_text(path))
     except json.JSONDecodeError as error:
@@ -64,7 +65,7 @@ def read_summary(path: Path) -> dict[str, Any]:
 
 
 def read_run(path: Path) -> Run:
-    """A run's folder. Raises `InputError` where it is not one."""
+    """Read a run's folder. Raises `InputError` if it is not one."""
     if not path.is_dir():
         raise InputError(f"{path}: no such run folder")
     if not (path / "run.toml").exists():

@@ -1,4 +1,4 @@
-"""What a car reported, as its pilot heard it: `telemetry.csv` back to readings."""
+"""A car's reports as its pilot received them: from `telemetry.csv` back to readings."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ from countersteer.signals import Channel, Reading, Readings, flat, unflat
 
 
 def readings_at(table: Table, channels: Readings, ticks: np.ndarray, dt: float) -> Readings:
-    """The sensors' last reports at some ticks (n,): leaves have an axis of n in front.
+    """The sensors' last reports at some ticks (n,); leaves have a leading axis of n.
 
-    A row tells what was new at its time; on board that is when a reading was taken. Raises
-    `InputError` where a column of the car's sensors is missing.
+    A row holds the readings that were new at its time. On board, that is the time of the reading.
+    Raises `InputError` if a column of the car's sensors is missing.
     """
     rows = np.rint(table["time_s"] / dt).astype(np.int32)
     found = [_column(table, channel, rows, ticks) for channel in flat(channels)]
@@ -19,7 +19,7 @@ def readings_at(table: Table, channels: Readings, ticks: np.ndarray, dt: float) 
 
 
 def _column(table: Table, channel: Channel, rows: np.ndarray, ticks: np.ndarray) -> Reading:
-    """One channel's readings."""
+    """The readings of one channel."""
     for name in channel.columns:
         if name not in table:
             raise InputError(f"telemetry.csv: column {name} is missing")
@@ -27,7 +27,7 @@ def _column(table: Table, channel: Channel, rows: np.ndarray, ticks: np.ndarray)
     new = np.nonzero(~np.isnan(values[:, 0]))[0]
     last = np.searchsorted(rows[new], ticks, side="right") - 1
     told = last >= 0
-    # Before its first report a sensor that listens for an echo has heard none.
+    # Before its first report, a sonar or lidar has no echo.
     silent = np.inf if channel.sensor.startswith(("sonar", "lidar")) else 0.0
     value = np.full((len(ticks), len(channel.columns)), silent)
     value[told] = values[new[last[told]]]

@@ -1,1 +1,1 @@
-"""What a drive is for: its goal, how it ends, and what its turns were like."""
+"""The task of a drive: its goal, its outcome, and the measures of its turns."""

@@ -1,10 +1,10 @@
-"""The turns of a drive, found from motion and course alone: whoever drives is judged alike.
+"""The turns of a drive, found from motion and course alone, so that all drivers are judged alike.
 
-Turn k begins when the heading is first 15° into corner k, counted from the corridor before it, and
-the car is near that corner: within `NEAR` corridor widths of its arc, and of no corner nearer. It
-ends when yaw rate and sideslip have been under 30 °/s and 10° for 50 ms, having been above in it;
-at the latest after 2 s, or as the next turn begins. A spin on a straight is no turn, and a car that
-spins the wrong way near a corner has not begun to turn round it.
+Turn k begins when the heading is first 15° into corner k, counted from the corridor before it. The
+car must be near that corner: within `NEAR` corridor widths of its arc, with no corner nearer. The
+turn ends when yaw rate and sideslip have been under 30 °/s and 10° for 50 ms, after they have been
+above. It ends at the latest after 2 s, or as another turn begins. A spin on a straight is no turn,
+nor is a spin the wrong way near a corner.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from countersteer.signals import Array, Motion, Scalar
 
 INTO = math.radians(15)  # heading into a corner at which its turn begins
 STRAIGHT_RATE, STRAIGHT_SLIP = math.radians(30), math.radians(10)
-STRAIGHT_FOR = 0.05  # s below both until a turn has ended
+STRAIGHT_FOR = 0.05  # s below both, after which a turn has ended
 LONGEST = 2.0  # s after which a turn has ended whatever the car does
 SLOW = 0.5  # m/s under which sideslip does not count
 STANDS = 0.2  # m/s under which the direction of motion means nothing
 ROUNDING = 1e-4  # s, of a time in 32 bits
 NEAR = 1.5  # widths of the corridor
-BEFORE = 0.5  # m of centre line before a turn at which the speed of entry is taken
+BEFORE = 0.5  # m of centre line before a turn's beginning; its entry speed is taken there
 MARK = 0.05  # m between two places whose speeds are kept
 MARKS = round(BEFORE / MARK) + 2
 
@@ -48,10 +48,10 @@ class Approach(NamedTuple):
 
 
 class Turns(NamedTuple):
-    """What is known of each turn; arrays of one number a turn. Times are inf until they come."""
+    """The turns so far: arrays of one number a turn. Times (s) are inf until they come."""
 
-    into: Array  # heading into the corner at the last sample
-    spun: Array  # whole turns (rad) that do not count for it; NaN while the car is not near
+    into: Array  # heading into the corner at the last sample, rad
+    spun: Array  # whole turns (rad) to subtract from it; NaN while the car is not near
     begin: Array
     end: Array
     stirred: Array  # 1 once the car has not gone straight in it
@@ -59,8 +59,8 @@ class Turns(NamedTuple):
     entry_speed: Array
     peak_sideslip: Array
     peak_yaw_rate: Array
-    overshoot: Array  # how far the heading went beyond the corridor behind, rad
-    error: Array  # heading less that corridor's, at the end
+    overshoot: Array  # largest heading beyond that of the corridor after it, rad
+    error: Array  # heading less that corridor's, at the end, rad
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,20 +75,20 @@ class TurnResult:
     heading_error_deg: float
     heading_overshoot_deg: float
     duration_s: float
-    handover_s: float | None  # when the driver said that it began the turn; None: it never did
+    handover_s: float | None  # beginning by the driver's own account; None: it gave none
 
 
 def sideslip(vx: Array, vy: Array) -> Array:
-    """Angle from the nose to the velocity (rad); 0 where the car all but stands, or goes back."""
+    """Angle from the nose to the velocity (rad); 0 below the speed `SLOW`, and backwards."""
     own = jnp if isinstance(vx, jax.Array) else np  # NumPy's arrays keep their precision
     counts = (vx**2 + vy**2 > SLOW**2) & (vx > 0)
     return own.where(counts, own.arctan2(vy, own.where(counts, vx, 1.0)), 0.0)
 
 
 def goes_straight(motion: Motion) -> Scalar:
-    """Whether yaw rate and sideslip are both under what ends a turn.
+    """Whether yaw rate and sideslip are both below the limits that end a turn.
 
-    Here sideslip counts down to `STANDS`, and backwards too: a car that has slowed down in the
+    Here sideslip counts down to the speed `STANDS`, and backwards too. A car that is slow in the
     middle of a slide, or goes backwards out of a spin, does not go straight.
     """
     vx, vy = motion.vx, motion.vy
@@ -105,12 +105,12 @@ def corners_of(course: Course, laps: int, dtype: Any) -> Corners:
     reach = NEAR * (course.width or 1.0) + np.array([abs(t.angle) * t.radius / 2 for t in turns])
     middles = (places[1:] + places[:-1]) / 2
     ends = np.concatenate([[-np.inf], middles, [np.inf]]) if turns else np.zeros(1)
-    # The bearing of the corridor before a corner is the first one's, and all corners between. That
-    # of the start is the car's own: it may stand turned.
+    # The bearing of the corridor before a corner is that of the first corridor plus all corners
+    # between. The heading at the start is no base: the car may stand at an angle.
     own = np.array([turn.distance for turn in course.turns])
     bent = np.array([turn.angle for turn in course.turns])
     bearings = math.atan2(*(course.line[1] - course.line[0])[::-1]) + np.cumsum(bent) - bent
-    # Of the corners of all rounds, those ahead are some in a row.
+    # The corners ahead are consecutive among the corners of all rounds.
     off = (own - places[0]) / course.length if len(turns) else np.zeros(1)
     first = int(np.argmin(np.abs(off - np.round(off) if course.closed else off)))
     before = bearings[(first + np.arange(len(turns))) % max(len(own), 1)]
@@ -119,7 +119,7 @@ def corners_of(course: Course, laps: int, dtype: Any) -> Corners:
 
 
 def before_any(count: int, dtype: Any) -> tuple[Turns, Approach]:
-    """So many turns, none of which has begun."""
+    """`count` turns before their beginning, and no speeds."""
     never, zero = np.full(count, np.inf, dtype), np.zeros(count, dtype)
     none = np.full(count, np.nan, dtype)
     turns = Turns(none, none, never, never, *[zero] * 7)
@@ -127,14 +127,14 @@ def before_any(count: int, dtype: Any) -> tuple[Turns, Approach]:
 
 
 def approached(old: Approach, distance: Scalar, speed: Scalar) -> Approach:
-    """The speeds with one sample more."""
+    """The speeds after one more sample."""
     here = jnp.floor(distance / MARK).astype(jnp.int32)
-    places = here - (here - jnp.arange(MARKS)) % MARKS  # that the slots are of by now
+    places = here - (here - jnp.arange(MARKS)) % MARKS  # that the slots hold now
     return Approach(jnp.where(places > old.last, speed, old.speed), here)
 
 
 def speed_before(seen: Approach, distance: Scalar) -> Scalar:
-    """The speed that the car had `BEFORE` metres of centre line ago."""
+    """The car's speed `BEFORE` metres of centre line earlier (m/s)."""
     at = (distance - BEFORE) / MARK
     place = jnp.floor(at)
     slot = place.astype(jnp.int32) + jnp.arange(2)
@@ -145,17 +145,17 @@ def speed_before(seen: Approach, distance: Scalar) -> Scalar:
 def follow(
     old: Turns, corners: Corners, seen: Approach, distance: Scalar, motion: Motion, time: Scalar
 ) -> Turns:
-    """The turns with one sample more, at a distance along the line."""
+    """The turns after one more sample, at a distance along the line."""
     rate, slip = jnp.abs(motion.yaw_rate), jnp.abs(sideslip(motion.vx, motion.vy))
     calm, hand = goes_straight(motion), jnp.sign(corners.angle)
     off, whole = motion.heading - corners.before, 2 * math.pi
     near = (distance >= corners.near) & (distance < corners.far)
     spun = jnp.where(jnp.isnan(old.spun), whole * jnp.round(off / whole), old.spun)
-    # All the way round the wrong way is as if it had not been.
+    # A whole turn the wrong way round does not count.
     back = jnp.isinf(old.begin) & (hand * (off - spun) < INTO - whole)
     spun = jnp.where(back, spun - hand * whole, spun)
     into = hand * (off - spun)
-    # What goes too far in one turn, and comes back, is not into the next of the same hand.
+    # An overshoot in one turn, and its return, do not begin the next turn of the same hand.
     in_turn = (old.begin <= time) & jnp.isinf(old.end)
     same = jnp.any(in_turn & (hand == hand[:, None]), axis=1)
     passes = (old.into < INTO) & (into - old.into < math.pi)
@@ -191,9 +191,9 @@ def follow(
 
 
 def results(turns: Turns, handover: Array, time: float) -> list[TurnResult]:
-    """Those that have begun. One that is under way ends at `time`, when the drive did.
+    """The turns that have begun. One under way ends at `time`, the end of the drive.
 
-    `handover` has the times at which the driver began its turns, inf where it did not.
+    `handover` has the times at which the driver began its turns, or inf.
     """
     found = []
     for i in np.nonzero(np.isfinite(turns.begin))[0].tolist():

@@ -1,1 +1,1 @@
-"""Logs to cars: windows of logs, the simulated car over them, and the fit of one to the other."""
+"""From logs to cars: windows of logs, their simulation, and the fit of a car to them."""

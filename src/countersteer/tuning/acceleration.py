@@ -1,4 +1,4 @@
-"""Fit the motor's resistance to steps of throttle from rest: the paper's `SimulatorAdjuster`.
+"""Fit the motor's resistance to steps of throttle from rest, as the paper's `SimulatorAdjuster`.
 
 Log and simulator run on the same commands. `motor.resistance` R is changed until their speeds
 agree. R alone is fitted, because it scales the acceleration at every throttle. With
@@ -10,9 +10,9 @@ agree. R alone is fitted, because it scales the acceleration at every throttle. 
 d is the duty, U the battery's open-circuit voltage, k the torque constant, n the gear ratio, e the
 efficiency and r the tyre radius. So R changes neither the no-load speed nor the drag.
 
-Each log holds one level of throttle. Its first second is compared:
+Each log holds one level of throttle. The first second after its onset is compared:
 
-    speed(t_i) = mean of v(t - late; R) over the reader's window about t_i, + e_i
+    speed(t_i) = mean of v(t - late; R) over the reader's window about t_i  +  e_i
 
 v is the speed of the simulated car (`planar.move`), straight and from rest. The reader of the speed
 gives the standard deviation of e_i.
@@ -59,12 +59,12 @@ AFTER = 0.2  # s simulated beyond `DURATION`, so that a car may be late or early
 LANES = 16  # levels in every simulation; with a fixed number, one program is compiled
 
 # Detection of a step
-SETTLES = 0.2  # s after the onset; by then a hand has moved the throttle to the level
-SAME = 0.02  # throttle; hands and filters change a held level by less from row to row
+SETTLES = 0.2  # s after the onset; by then the operator has reached the level
+SAME = 0.02  # throttle; a held level stays within this of its value
 LEAST = 0.4  # s, shortest hold of a level
 STRAIGHT = math.radians(5)  # steering; beyond it, a step is not straight
 STILL = 0.1  # m/s before the onset; above it, the car rolls
-MOVED = 0.03  # m in a second; less may be play, or an encoder's first count
+MOVED = 0.03  # m in a second; less may be backlash, or an encoder's first count
 FEWEST = 3  # readings; two would fix speed and lateness, with none left to check them
 
 HUBER = 1.345  # spreads at which the loss turns linear: 95 % efficient for normal errors
@@ -126,7 +126,7 @@ class Step(NamedTuple):
 
     path: Path
     level: float
-    commands: Table  # with the throttle at the motor
+    commands: Table  # with the throttle that reaches the motor
     onset: float  # s
     charge: float  # of the battery, 0 to 1
     row: float  # s between two commands

@@ -1,15 +1,15 @@
-"""Which log would help most next: from what a fit left open to manoeuvres that tell of it."""
+"""Advice on the next log: manoeuvres that determine the parameters that a fit left open."""
 
 import math
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
 from typing import Any
 
-WEAK = 0.25  # deviation over value from which a parameter is known only roughly
-TRIM = 2.0  # degrees: what a deviation is compared with where the value may well be zero
-MOST = 5  # pieces of advice
+WEAK = 0.25  # deviation over value; above it, a parameter is known only roughly
+TRIM = 2.0  # degrees; the least divisor of an angle's deviation, since an angle may be zero
+MOST = 5  # lines of advice
 
-LOGS = {  # a log, and the parameters that show in it
+LOGS = {  # a log: the parameters that it determines
     "hard launches and hard braking in a straight line, with motion capture": (
         "tires.*.longitudinal_stiffness",
     ),
@@ -58,11 +58,11 @@ OTHER = "longer runs, of more kinds of manoeuvre than these"
 
 
 def next_log(parameters: Sequence[Mapping[str, Any]]) -> str:
-    """Say which logs would help, a line each, the one that would help most first.
+    """The logs that would help, one line each, the most helpful first; at most `MOST` lines.
 
-    Each of `parameters` has `path`, `surface` (or None), `value`, `deviation`, `unit`, `determined`
-    as in the result of a tuning, in the units of files. Those not determined come before those that
-    are known only roughly (`WEAK`), each by its deviation over its value.
+    Each of `parameters` has `path`, `surface` (or None), `value`, `deviation`, `unit` and
+    `determined`, as in the result of a tuning, in the units of files. Parameters that are not
+    determined come first, then those above `WEAK`. Both groups are sorted by `doubt`.
     """
     wanted: dict[tuple[str, str | None], list[Mapping[str, Any]]] = {}
     for parameter in sorted(parameters, key=_rank, reverse=True):
@@ -84,7 +84,7 @@ def next_log(parameters: Sequence[Mapping[str, Any]]) -> str:
 
 
 def doubt(parameter: Mapping[str, Any]) -> float:
-    """The deviation over the value; of an angle that may be zero, over `TRIM`."""
+    """The deviation over the magnitude of the value. An angle counts as at least `TRIM`."""
     deviation, value = parameter["deviation"], abs(parameter["value"])
     if not math.isfinite(deviation):
         return math.inf
@@ -96,7 +96,7 @@ def doubt(parameter: Mapping[str, Any]) -> float:
 
 
 def log_for(path: str) -> str:
-    """The log of `LOGS` in which a parameter shows."""
+    """The log of `LOGS` that determines a parameter, else `OTHER`."""
     for log, patterns in LOGS.items():
         if any(fnmatch(path, pattern) for pattern in patterns):
             return log

@@ -1,18 +1,18 @@
-"""A log against the simulator: open loop on the log's own commands, from many instants of it.
+"""Compare a log with the simulator in many windows, open loop on the log's own commands.
 
-A window starts from the measured state and runs to its end without looking at the log again, but
-for the commands. Windows start every 0.25 s where the dead-man switch is closed throughout and the
-speed is at least 0.2 m/s, and at each throttle onset from rest. The reference is motion capture, or
-the state itself where the run was simulated. Where there is neither, it is the logged encoder and
-gyroscope, against simulated ones with the same lag and quantum.
+A window starts from the measured state. After that, the simulation gets only the log's commands.
+Windows start every 0.25 s at 0.2 m/s or more, and at each throttle onset from rest. The dead-man
+switch is closed throughout a window. The reference is motion capture, or the state itself for a
+simulated run. Without both, it is the logged encoder and gyroscope. They are compared with
+simulated sensors of the same lag and quantum.
 
-How full the battery was, logs seldom tell, and a pack nearly empty turns the wheels a fifth slower.
-Where `run.toml` does not, it is one number for the whole log, chosen so that the windows agree best
-(`agreeing_charge`); the errors with a full battery stand beside.
+Logs seldom state the battery charge, and a nearly empty pack turns the wheels a fifth slower. If
+`run.toml` does not state it, one charge for the whole log is fitted to the windows
+(`agreeing_charge`). The errors with a full battery are given too.
 
-A steady drift is predicted by doing nothing. So the same errors are given for the prediction that
-nothing changes (`persistence`), and all of it for those windows in which something does
-(`transient`), and for those in which the car drives forward and slides (`sliding`).
+A steady drift is predicted well by persistence, the prediction that nothing changes. So the same
+errors are given for `persistence`. All errors are repeated for windows in which something changes
+(`transient`), and for windows in which the car drives forward and slides (`sliding`).
 """
 
 import dataclasses
@@ -46,20 +46,20 @@ from countersteer.tuning.windows import (
 if TYPE_CHECKING:
     pass
 
-HORIZON = 1.0  # s, unless given
-SAMPLE = 0.01  # s between the instants at which states are compared
-SLIDE = math.radians(20)  # sideslip that a sliding window reaches
-CHARGED_BY = 128  # windows of a log, at most, that its battery is judged by
-CHARGE_WITHIN = 0.01  # of a full one
+HORIZON = 1.0  # s, by default
+SAMPLE = 0.01  # s between compared states
+SLIDE = math.radians(20)  # least peak sideslip of a sliding window
+CHARGED_BY = 128  # most windows of a log in the fit of its battery charge
+CHARGE_WITHIN = 0.01  # tolerance of the fitted charge; a full battery has 1
 
 
 class Compared(NamedTuple):
-    """One quantity in one window."""
+    """One quantity in one window, at the compared instants."""
 
     time: np.ndarray  # s
     measured: np.ndarray
     simulated: np.ndarray
-    unchanged: np.ndarray  # predicted by doing nothing
+    unchanged: np.ndarray  # predicted by persistence
 
 
 Window = dict[str, Compared]  # by quantity
@@ -70,14 +70,14 @@ def compare(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare a car with a log of it over windows of `horizon` seconds, at steps of dt seconds.
 
-    Without a horizon there is one window, from the first command to the last. Returns what the
-    command line prints as JSON, and the series that `draw_comparison` draws: `median_abs_error` is
-    at the windows' ends (the last reading before it, for a sensor), `rmse` over the whole of them.
-    Windows that lack a reference are dropped; raises `InputError` where none is left.
+    Without a horizon there is one window, from the first command to the last. Returns the JSON of
+    the command line, and the series for `draw_comparison`. `median_abs_error` is taken at the ends
+    of windows (for a sensor, at the last reading before), `rmse` over whole windows. Windows
+    without a reference are dropped. Raises `InputError` if none is left.
 
-    Not in the log and taken as known: nothing was asked of the car before the first command; the
-    servo is where the car's own law puts it for these commands; the battery is as `run.toml` says,
-    or else as full as agrees best (then `as_if_full` has the errors with a full one).
+    Three assumptions replace what a log lacks. There was no command before the first one. The
+    servo follows the car's own law. The battery has the charge of `run.toml`, or else the one that
+    agrees best; then `as_if_full` has the errors with a full battery.
     """
     if horizon is not None and not dt <= horizon < math.inf:
         raise InputError(f"--horizon {horizon:g}: give at least a step of {dt:g} s, or run")
@@ -140,7 +140,7 @@ def compare(
 
 
 class Simulation:
-    """A log's windows, simulated from what was measured at their starts."""
+    """A log's windows, each simulated from the measured state at its start."""
 
     def __init__(
         self,
@@ -153,7 +153,7 @@ class Simulation:
         dt: float,
         whole: bool,
     ) -> None:
-        """Windows of so many ticks; see `compared` for `whole`."""
+        """`starts` are ticks, and a window has `ticks` of them. See `compared` for `whole`."""
         self.car, self.commands, self.ticks, self.dt = car, run.commands, ticks, dt
         self.references, self.whole = find_references(measured), whole
         with jax.enable_x64(True):
@@ -163,7 +163,7 @@ class Simulation:
         self.states = jax.tree.map(lambda leaf: leaf[known], states)
 
     def windows(self, charge: float | None = None) -> tuple[list[Window], list[float]]:
-        """Those that have a reference, and when they start (s); with another charge, if given."""
+        """The windows with a reference, and their start times (s). `charge` replaces the run's."""
         if not len(self.starts):
             return [], []
         states, dt = self.states, self.dt
@@ -186,7 +186,7 @@ class Simulation:
 
 
 def agreeing_charge(run: Run, car: Car, measured: Measured, dt: float) -> float:
-    """How full the battery was, by the same cost over windows of a log as `fit` minimises."""
+    """The battery charge that minimises the cost of `fit` over the windows of a log."""
     ticks = round(fit.HORIZON / dt)
     starts, resting = window_starts(measured, run.commands, ticks, dt)
     chosen = np.arange(0, len(starts), max(1, math.ceil(len(starts) / CHARGED_BY)))
@@ -225,10 +225,10 @@ def compared(
     resting: bool,
     whole: bool,
 ) -> Window | None:
-    """Make a window of simulated quantities, a value a tick; None where a reference is missing.
+    """A window of simulated quantities with a value for each tick; None if a reference is missing.
 
-    A sensor may have no reading in a short window, as long as there is a state to compare with.
-    With `whole`, what is missing is left out and the rest compared.
+    A sensor without a reading in a short window is left out, if another quantity can be compared.
+    With `whole`, samples without a reference are left out too.
     """
     ticks = len(next(iter(predicted.values()))) - 1
     time = start + dt * np.arange(ticks + 1)
@@ -261,9 +261,9 @@ def compared(
 def sensed(
     reference: Reference, time: np.ndarray, values: np.ndarray, at: np.ndarray, resting: bool
 ) -> np.ndarray:
-    """Give what the reference's sensor would have reported at these times of a window.
+    """The simulated readings of the reference's sensor at the times `at` of a window.
 
-    Readings early in a window reach back before its start: there, the measured quantity is taken.
+    Early readings cover time before the start of the window. The measured quantity is used there.
     """
     if reference.timing is None:
         return np.interp(at, time, values)
@@ -283,9 +283,9 @@ def sensed(
 
 
 def changes(window: Window) -> bool:
-    """Whether the motion departs from where it started by as much as `CHANGES`.
+    """True if the motion changes from its start by more than `CHANGES`.
 
-    Where the forward velocity is not measured, the wheel speed stands for it.
+    The wheel speed replaces a forward velocity that was not measured.
     """
     limits = CHANGES if "vx_mps" in window else CHANGES | {"wheel_speed_mps": CHANGES["vx_mps"]}
     return any(
@@ -296,7 +296,7 @@ def changes(window: Window) -> bool:
 
 
 def slides(window: Window) -> bool:
-    """Whether the car goes forward all through the window and reaches `SLIDE`, as measured."""
+    """True if the measured car drives forward throughout the window and reaches `SLIDE`."""
     if not {"vx_mps", "vy_mps"} <= window.keys():
         return False
     both = (window["vx_mps"], window["vy_mps"])
@@ -305,7 +305,7 @@ def slides(window: Window) -> bool:
 
 
 def scores(windows: Iterable[Window]) -> dict[str, Any]:
-    """Both measures of error, by quantity, of the simulation and of the unchanging state."""
+    """Both measures of error, by quantity, of the simulation and of persistence."""
     windows = list(windows)
     result: dict[str, Any] = {"median_abs_error": {}, "rmse": {}}
     still: dict[str, Any] = {"median_abs_error": {}, "rmse": {}}

@@ -38,7 +38,7 @@ from countersteer.tuning import shooting
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import QUANTITIES
 
-STEP = 0.002  # s, of the simulation; its error is then a hundredth of a log's error
+STEP = 0.002  # s, of the simulation; its error is then 1 % of the measurement's
 HORIZON = 1.0  # s, length of a window
 SCALES = np.array([0.05, 0.03, 0.12, 0.08])  # of `QUANTITIES`, SI units: errors of a good fit
 LOOSE = 0.5  # prior standard deviation of a logarithm that is not in `WIDTHS`
@@ -46,16 +46,16 @@ LANES = 64  # windows in every call of the compiled program; shorter blocks are 
 GROUP = 8  # derivatives that one lane computes
 OUTLYING = 0.2  # normalised residual at which the loss turns linear
 GROSS = 0.5  # upper limit of a squared residual in the estimate of the noise
-WILD = 1e3  # slope of a residual per prior width from which a window counts as chaotic
+WILD = 1e3  # change of a residual per prior width; beyond it, a window is chaotic
 TOLERANCE = 1e-5  # relative decrease of the cost at which a search ends
 PASSES = 40  # largest number of steps in a search
 DAMPING, EASY, STUCK = 0.01, 1e-6, 1e4  # of a step: first, least, and where a search gives up
-KNOWN = 0.9  # posterior over prior deviation; below it, a parameter is determined
+KNOWN = 0.9  # ratio of posterior to prior deviation; below it, a parameter is determined
 STRAIGHT = math.radians(4)  # steering; below it, a window is straight
 SLIDES = math.radians(10)  # sideslip; beyond it, a window slides
 SPINS = 0.5  # m/s of wheel speed above ground speed; beyond it, a window slides too
 HELD_OUT = 2.0  # s, length of a block; whole blocks are fitted or held out
-BRIEF = 10.0  # s; a log whose windows start within less is one manoeuvre
+BRIEF = 10.0  # s; a log whose starts of windows span less is one manoeuvre
 
 ROLLING = ("drivetrain.drag", "drivetrain.drag_viscous")
 TIRES = (
@@ -122,7 +122,7 @@ class Stage(NamedTuple):
     """The parameters of one fit, and the windows that it uses."""
 
     parameters: tuple[str, ...]
-    chooses: Callable[[Shots], np.ndarray]  # mask of the windows in which they show
+    chooses: Callable[[Shots], np.ndarray]  # mask of the windows that excite them
 
 
 def straight(shots: Shots) -> np.ndarray:
@@ -264,7 +264,8 @@ def blocks(time: np.ndarray, run: np.ndarray, fold: int = 2) -> np.ndarray:
 
     Time is cut into blocks of `HELD_OUT` seconds. Of every three blocks, the one of number `fold`
     (0 to 2) is held out and two are fitted. A window that overlaps both kinds is neither. A `brief`
-    log is fitted whole if there are longer ones: it is one manoeuvre, and its parts differ.
+    log is fitted whole if there are longer ones: it is one manoeuvre, whose parts cannot test each
+    other.
     """
     held = [np.floor((time + lead) / HELD_OUT) % 3 == fold for lead in (0.0, HORIZON)]
     kind = np.where(held[0] & held[1], 2, np.where(held[0] | held[1], 0, 1))
@@ -354,7 +355,7 @@ class Problem:
         self.prior = np.clip(self.prior, self.low + margin, self.high - margin)
 
     def tabled(self, cars: dict[str, Car], charge: np.ndarray | None = None) -> np.ndarray:
-        """The values of `TABLE` for each log, or `charge` if it states none: (logs, `TABLE`)."""
+        """The values of `TABLE` for each log, `charge` where it states none: (logs, `TABLE`)."""
         logs = len(self.surface)
         charges = np.full(logs, FULL) if charge is None else charge[:logs].copy()
         stated = np.isfinite(self.shots.charge)
@@ -388,7 +389,7 @@ class Problem:
         return in_lanes(predicted, self.base, self.filled(u)[self.shots.run], self.shots)
 
     def residuals(self, u: Array) -> np.ndarray:
-        """The residuals of all samples, then those of the prior: (samples + parameters,).
+        """The residuals of all samples, then those of the prior, in one row.
 
         A residual is 0 if the sample is unknown, and 100 if the prediction is NaN.
         """
@@ -661,7 +662,7 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
 
     deviation = sqrt(diag(inverse(D'D / noise + P'P))), where D and P are the Jacobian's rows of
     data and prior. They are weighted by the curvature of the loss. A window counts as one
-    observation of each quantity, since w divides by the root of its samples. noise is the sum of
+    observation of each quantity, since w contains 1/sqrt(samples). noise is the sum of
     the squared residuals, each at most `GROSS`, over the observations. It is at least 1.
 
     The parameter with the largest ratio of deviation to prior width is fixed. This repeats until
@@ -713,7 +714,7 @@ def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarr
 def errors(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
     """Errors of each measured quantity: simulated, and by persistence (no change after the start).
 
-    An error is the median magnitude at the ends of windows, and the RMS over all their samples.
+    Each quantity has two numbers: `median_abs_error` at the ends of windows, and `rmse` over all.
     """
     found = Problem(cars, shots, ()).predictions()
     start = np.stack(

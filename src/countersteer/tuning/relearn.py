@@ -1,23 +1,22 @@
-"""Whether a driver should be learned again: a car judged on new runs beside those that it knows.
+"""Decide whether to learn a driver again, from a car's errors on new and on old runs.
 
-The loop of learning with a model is drive, judge the model on what was driven, fit it again, learn
-the driver again. The last is worth its while only where the model had come apart from the car.
-So, of each window of a log, the error of the car's prediction is
+Learning with a model is a loop: drive, judge the model on the new runs, fit it again, learn the
+driver again. The last step is worth its cost only if the model no longer agrees with the car. The
+error of the car's prediction in a window of a log is
 
-    e = log sqrt(mean over what is known of it of ((predicted - measured) / scale)² + FAINT²)
+    e = log sqrt(mean over known samples of ((predicted - measured) / scale)² + FAINT²)
 
-and the excess is the mean over the new windows of e less that of old windows of their kind
-(straight, steered, sliding), as a factor exp(). It must be beyond two things that separate any runs
-from those that a car was fitted to, both taken from the old runs alone. These are cut into
-`PIECES` pieces of time:
+The excess is the mean of e over the new windows, less the mean of e over old windows of the same
+kind (straight, steered, sliding). It is given as a factor exp(). Two effects separate any new run
+from the runs of the fit. Both are estimated from the old runs, cut into `PIECES` pieces of time:
 
-- what was fitted is met better. Cars are fitted to either half of the pieces; the mean of e where
-  a window was not fitted less that where it was is the optimism.
-- runs differ. With s the standard deviation between pieces of their mean e, and the new runs as
-  long as k pieces, the excess has the standard deviation s sqrt(1/k + 1/PIECES); Student's t with
-  PIECES - 1 degrees of freedom gives how many of these chance reaches once in a hundred.
+- Optimism: a car predicts the data of its fit better. Cars are fitted to each half of the pieces.
+  The optimism is the mean of e outside the fit, less the mean of e inside it.
+- Chance: runs differ. s is the standard deviation of the mean e of the pieces. If the new runs are
+  as long as k pieces, the excess has the standard deviation s sqrt(1/k + 1/PIECES). Student's t
+  with PIECES - 1 degrees of freedom gives the limit that chance exceeds once in a hundred.
 
-And it must be worth while: beyond `LEAST` at any rate.
+The driver is learned again if the excess exceeds the product of both factors, and `LEAST`.
 
 Source of the loop: P. Abbeel, A. Coates, M. Quigley, A. Y. Ng, An application of reinforcement
 learning to aerobatic helicopter flight, NIPS 2006.
@@ -36,27 +35,27 @@ from countersteer.tuning import fit
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.tune import Logs
 
-FAINT = 0.2  # normalised error that counts as none: a fifth of what a good fit is off by
-PIECES = 8  # of the old runs, in the order of their time
-CHANCE = 0.01  # of calling for a driver where nothing has changed
-LEAST = 1.1  # factor of the error up to which no one learns a driver again
-PASSES = 12  # steps of the fit to a half, at most
-KINDS = (fit.straight, fit.steered, fit.slides)  # a later one takes precedence
+FAINT = 0.2  # normalised error that counts as none: a fifth of a good fit's error
+PIECES = 8  # of the old runs, in order of time
+CHANCE = 0.01  # probability of a false alarm: a new driver although nothing has changed
+LEAST = 1.1  # factor of the error; a smaller one does not justify a new driver
+PASSES = 12  # largest number of steps in the fit to a half
+KINDS = (fit.straight, fit.steered, fit.slides)  # if several hold, the last counts
 
 
 def window_errors(cars: Mapping[str, Car], shots: Shots) -> np.ndarray:
-    """Give e, as above, of each window."""
+    """The error e, as defined above, of each window: (windows,)."""
     problem = fit.Problem(dict(cars), shots, ())
     found = problem.predictions()
     off = np.where(problem.known, (found - shots.measured) / fit.SCALES[:, None], 0.0)
-    # A prediction that came to nothing is a bad one, not an absent one.
+    # A prediction of NaN counts as a large error, not as an unknown one.
     squares = np.sum(np.nan_to_num(off, nan=1e2) ** 2, axis=(1, 2))
     known = np.sum(problem.known, axis=(1, 2))
     return np.log(np.sqrt(squares / np.maximum(known, 1) + FAINT**2))
 
 
 def kinds(shots: Shots) -> np.ndarray:
-    """What each window tells of, as an index of `KINDS`."""
+    """The kind of each window, as an index of `KINDS`: (windows,)."""
     kind = np.zeros(len(shots.surface), int)
     for number, chooses in enumerate(KINDS):
         kind[chooses(shots)] = number
@@ -64,13 +63,13 @@ def kinds(shots: Shots) -> np.ndarray:
 
 
 def pieces_of_time(run_of: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """The piece, 0 to `PIECES` - 1, of each window: as many windows each, in order of time."""
+    """Cut windows by run and time into `PIECES` equal pieces: their indices (windows,)."""
     rank = np.argsort(np.lexsort((start, run_of)))
     return rank * PIECES // len(rank)
 
 
 def optimism(cars: dict[str, Car], shots: Shots, piece: np.ndarray, free: tuple[str, ...]) -> float:
-    """Mean e of windows by cars fitted to the other half of the pieces, less that by their own."""
+    """Mean e with the car fitted to the other half of the pieces, less that with its own; >= 0."""
     cars_of = []
     for half in (0, 1):
         problem = fit.Problem(cars, fit.select(shots, piece % 2 == half), free)
@@ -90,13 +89,13 @@ def judge(
     hold_out: bool,
     report: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """What `tune --new` says: `after` is the refit with both.
+    """The result of `tune --new`: `before` is the old car, `after` the refit to old and new runs.
 
-    Errors are exp of the mean e: 1 is what a good fit is off by. `learn_again` is whether
-    `excess`, the factor by which the new runs' exceeds the old ones', is beyond `threshold`;
-    `gain` is the part of the new runs' error that the refit took away in those of their windows
-    held out of it (`hold_out`, as in `tune.tune`), or else in all. A battery that a log does not
-    tell of is as full as agrees best with the car before: that it ran down is no fault of the car.
+    Errors are exp of the mean e; a good fit has 1. `learn_again` is true if `excess`, the error on
+    the new runs over that on the old ones, exceeds `threshold`. `gain` is the part of the new
+    runs' error that the refit removed. It is measured on their windows held out of the refit
+    (`hold_out`, as in `tune.tune`), or else on all. A charge that a log does not state is fitted
+    with the car before, since a discharged battery is no error of the car.
     """
     if len(old.start) < 2 * PIECES:
         raise InputError(

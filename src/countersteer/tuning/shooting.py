@@ -1,8 +1,8 @@
-"""Multiple shooting: many windows of logs at once, simulated from what was measured at their start.
+"""Multiple shooting: many windows of logs at once, each simulated from its measured start.
 
-Windows are short enough that errors of a car's parameters show before chaos does. All of a window
-depends on the car by JAX: where the servo and the speed controller stand at its start, what the
-wheels turn at, and the motion to its end. So residuals have exact derivatives.
+Windows are short enough that parameter errors show before chaos does. JAX traces a whole window
+from the car's parameters: servo, speed controller and wheel speeds at its start, and the motion to
+its end. So residuals have exact derivatives.
 """
 
 import math
@@ -30,8 +30,8 @@ from countersteer.tuning.windows import (
 from countersteer.world import plant
 from countersteer.world.chassis import Vector
 
-BEFORE = 0.6  # s before a window in which servo and controller settle from an old command
-SAMPLE = 0.05  # s between the instants at which motions are compared
+BEFORE = 0.6  # s of commands before a window, in which servo and controller settle
+SAMPLE = 0.05  # s between compared motions
 
 
 class Shots(NamedTuple):
@@ -40,27 +40,28 @@ class Shots(NamedTuple):
     run: Array  # index of the log
     surface: Array  # index of the surface
     velocity: Vector  # at the start, of the centre of mass in the body's axes
-    acceleration: tuple[Array, Array]  # that the loads follow, forward and left
+    acceleration: tuple[Array, Array]  # at the start, forward and left; sets the wheel loads
     wheel_speed: Array  # mean rim speed; NaN: wheels roll
-    rims: Wheels  # rim speeds; NaN: not known one by one
-    charge: Array  # of the battery; NaN: the log does not tell
-    throttle: Array  # (windows, ticks from `BEFORE` on), asked for
+    rims: Wheels  # rim speeds; NaN: not known for each wheel
+    charge: Array  # of the battery; NaN: not stated by the log
+    throttle: Array  # command: (windows, ticks from `BEFORE` on)
     steering: Array
     measured: Array  # (windows, quantities, samples after the start); NaN: not known
 
 
 def joined(parts: Sequence[Shots]) -> Shots:
-    """All windows in one."""
+    """The windows of all parts in one `Shots`."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def take(
     run: Run, car: Car, number: int, surface: int, horizon: float, every: float, dt: float
 ) -> tuple[Shots, np.ndarray] | None:
-    """The windows of the run of this number, `every` seconds, and when they start; None if none.
+    """The windows of a run, and their start times (s): (windows,). None if there are none.
 
-    They are those that `replay --compare` judges by; the car serves for what is known of it: its
-    radii, and which quantities its readings are.
+    They are windows of `replay --compare`, at least `every` seconds apart; all starts from rest
+    are kept. `number` is the index of the run. The car gives its wheel radii and the timing of its
+    sensors.
     """
     measured = read_measured(run, car)
     ticks = round(horizon / dt)
@@ -112,7 +113,7 @@ def take(
 
 
 def predict(car: Car, shot: Shots, dt: float) -> Array:
-    """What the car would do in one window, whose charge is known: (quantities, samples)."""
+    """The simulated quantities of one window with a known charge: (quantities, samples)."""
     samples = shot.measured.shape[-1]
     every = round(SAMPLE / dt)
     before = round(BEFORE / dt)
@@ -129,14 +130,14 @@ def predict(car: Car, shot: Shots, dt: float) -> Array:
         lambda state: quantities_of(car, state.motion),
     )
     vx, vy, yaw_rate, rims = seen
-    # An encoder counts over two samples; the one before the window is as the one at its start.
+    # An encoder counts over two samples. The one before the window equals the one at its start.
     line = jnp.concatenate([quantities_of(car, motion)[3][None], rims, rims[-1:]])
     counted = (line[:-2] + 2 * line[1:-1] + line[2:]) / 4
     return jnp.stack([vx, vy, yaw_rate, counted])
 
 
 def _start(car: Car, shot: Shots, angle: Scalar, duty: Scalar) -> Motion:
-    """The state at a window's start, as far as it was measured."""
+    """The state at a window's start from the measured quantities. The pose is 0."""
     rims = rolling(car, shot.velocity, angle, shot.wheel_speed)
     wheels = Wheels(
         *(

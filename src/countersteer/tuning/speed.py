@@ -1,7 +1,7 @@
-"""A car's speed over time from what it reports, with the standard deviation of each value.
+"""A car's speed over time from its sensors, with the standard deviation of each value.
 
-Three readers: the wheel encoder, the front sonar before a wall, lines on the floor. Each value is
-placed at the middle of what it is the mean over, so that a steady acceleration does not bias it.
+Three readers: the wheel encoder, the front sonar before a wall, lines on the floor. Each value
+stands at the middle of its averaging time, so that a steady acceleration does not bias it.
 """
 
 import itertools
@@ -15,36 +15,36 @@ from countersteer.errors import InputError
 from countersteer.runs.defects import readings
 from countersteer.runs.run import Run
 
-# A count over a window begins and ends somewhere between two edges: it is off by the difference of
-# two uniform numbers of one count each. So is a time between two events that are seen in rows.
+# A count over a window begins and ends between two edges. Its error is the difference of two
+# uniform numbers of one count each. The same holds for the time between two events seen in rows.
 ROUNDED_TWICE = 1 / math.sqrt(6)
 
-FINEST = 1e-3  # m/s; readings that are closer differ by their clock, not by a count
-WINDOW = 0.2  # s of echoes that a line is laid through: 8 at 40 Hz
-FEWEST = 5  # echoes on a line: two lay it, three more say that it is one
-SPIKE = 3.0  # standard deviations off its line, beyond which an echo is of something else
-ROUNDS = 5  # of telling spikes by the spread and the spread by what is no spike
-RESOLVED = 1e-3  # m; no sonar tells less
-ASTRAY = 1.4  # by which slopes err more than their line's echoes say: those of a wall's edges that
-# lie within `SPIKE` of it pass for the wall's own (measured: 20 steps of throttle of `rx7`)
-LIKE_MEAN = 0.6  # a line's slope weighs the speed by a parabola, of 3/5 of a flat mean's variance
-TO_DEVIATION = 1.4826  # a normal variable's standard deviation over its median magnitude
+FINEST = 1e-3  # m/s; a smaller difference of readings is due to their clock, not to a count
+WINDOW = 0.2  # s of echoes for each line: 8 at 40 Hz
+FEWEST = 5  # echoes on a line: two define it, three more confirm it
+SPIKE = 3.0  # standard deviations off the line; beyond, an echo is a spike
+ROUNDS = 5  # iterations between the spikes and the spread without them
+RESOLVED = 1e-3  # m, finest resolution of a sonar
+ASTRAY = 1.4  # true error of a slope over the error by its line's echoes. Echoes of a wall's edges
+# within `SPIKE` of the line pass for the wall's own (measured: 20 throttle steps of `rx7`)
+LIKE_MEAN = 0.6  # a line's slope weighs the speed by a parabola: 3/5 of a flat mean's variance
+TO_DEVIATION = 1.4826  # standard deviation of a normal variable over its median magnitude
 
 
 class Speed(NamedTuple):
-    """Speed as a sensor tells it."""
+    """Speed from a sensor."""
 
     time: np.ndarray  # s, rising
-    value: np.ndarray  # m/s; forward and backward alike for the encoder and for lines
-    deviation: np.ndarray  # m/s; one standard deviation. Where two values meet, at a count or a
-    # line, one's error is in part the other's with its sign turned; else errors are independent.
-    over: np.ndarray  # s; the time about `time` that the value is the mean over
+    value: np.ndarray  # m/s; encoder and lines do not give the sign
+    deviation: np.ndarray  # m/s, standard deviation. Neighbours that share a count or a line share
+    # part of their error with opposite sign. All other errors are independent.
+    over: np.ndarray  # s, averaging time around `time`
 
 
 def read_speed(run: Run, source: str) -> Speed:
-    """Speed from `encoder`, `sonar` or `lines`.
+    """Speed by the reader `source`: `encoder`, `sonar` or `lines`.
 
-    Raises `InputError` where the run has no such sensor.
+    Raises `InputError` if there is no such reader, or if the run has no such sensor.
     """
     if source not in READERS:
         raise InputError(f"no reader of speed {source}: give one of {', '.join(READERS)}")
@@ -52,10 +52,11 @@ def read_speed(run: Run, source: str) -> Speed:
 
 
 def from_encoder(run: Run) -> Speed:
-    """Rim speed of the wheel with the encoder, or the wheels' mean where it is on the shaft.
+    """Rim speed of the wheel with the encoder, or the wheels' mean if the encoder is on the shaft.
 
-    A reading is the mean since the one before, in whole counts: the deviation is a count's speed
-    over the root of 6. Its size is told by `encoder_counts`, else by the readings' least step.
+    A reading is the mean since the one before, in whole counts. Its deviation is the speed of one
+    count over the root of 6. That speed is from `encoder_counts`, else from the readings' least
+    step.
     """
     time, speed = _reported(run, "wheel_speed_mps")
     window = np.diff(time)
@@ -67,14 +68,14 @@ def from_encoder(run: Run) -> Speed:
 def from_sonar(run: Run) -> Speed:
     """Speed towards a wall straight ahead, from `sonar_front_m`.
 
-    Through the echoes of each 0.2 s the line is laid that half of them are nearest to (least median
-    of squares); echoes off it are spikes, and by least squares of the rest the slope is found, with
-    deviation `ASTRAY` s / sqrt(sum (t - mean t)²). The spread s is that of all windows' echoes
-    about their lines. A window in which most pings are spikes or unanswered gives no value.
+    In each 0.2 s, a line is fitted to the echoes by the least median of squares. Echoes far off it
+    are spikes. Least squares of the rest give the slope, with the deviation
+    `ASTRAY` s / sqrt(sum (t - mean t)²). s is the spread of all windows' echoes about their lines.
+    A window in which most pings are spikes or unanswered gives no value.
     """
     windows = list(_windows(*_reported(run, "sonar_front_m")))
     lines = [_least_median(t, d) for t, d, _ in windows]
-    # The spread is not known beforehand: what lies on a line tells it, and it tells what does.
+    # The spread depends on which echoes lie on a line, and these depend on the spread: iterate.
     spread, kept = math.inf, []
     for _ in range(ROUNDS):
         off = [
@@ -108,9 +109,9 @@ def from_sonar(run: Run) -> Speed:
 def from_lines(run: Run) -> Speed:
     """Speed over lines that are `line_spacing_m` of `run.toml` apart, from `line_crossings`.
 
-    Lines passed times their spacing, over the time between two rows in which the count rises. A
-    line was passed anywhere between its row and the row before, so that a time T is off by the
-    difference of two uniform numbers, and the speed v by v/T times that.
+    speed = lines passed · spacing / time between two rows in which the count rises. A line was
+    passed anywhere between its row and the row before. So the error of a time T is the difference
+    of two uniform numbers, and the error of the speed v is v/T times that.
     """
     spacing = run.about.get("line_spacing_m")
     if not isinstance(spacing, float | int) or not 0 < spacing < math.inf:
@@ -123,7 +124,7 @@ def from_lines(run: Run) -> Speed:
     rising = np.concatenate([[True], passed > 0])
     time, counts = time[rising], counts[rising]
     if counts[0] == 0:
-        time, counts = time[1:], counts[1:]  # nothing was passed yet
+        time, counts = time[1:], counts[1:]  # no line was passed yet
     if len(time) < 2:
         raise InputError(f"{run.path}/telemetry.csv: line_crossings holds no two lines")
     assert run.telemetry is not None
@@ -154,7 +155,7 @@ def _quantum(run: Run, speed: np.ndarray) -> float:
     """Speed of one count in a window (m/s)."""
     counts = readings(run, "encoder_counts")[1]
     passed = np.diff(counts) if len(counts) == len(speed) else np.zeros(len(speed) - 1)
-    told = (passed > 0) & (speed[1:] > 0)  # one of the two may be stuck
+    told = (passed > 0) & (speed[1:] > 0)  # one of the two columns may be stuck
     if np.any(told):
         return float(np.median(speed[1:][told] / passed[told]))
     steps = np.diff(np.unique(np.append(speed, 0.0)))
@@ -167,7 +168,7 @@ def _quantum(run: Run, speed: np.ndarray) -> float:
 def _windows(
     time: np.ndarray, distance: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-    """Times and distances of the echoes of each window, and how many must lie on a line."""
+    """Times and distances of the echoes of each window, and the fewest that must lie on a line."""
     for start in np.arange(time[0], time[-1], WINDOW):
         inside = (time >= start - 1e-9) & (time < start + WINDOW - 1e-9)
         least = max(FEWEST, np.sum(inside) / 2)
@@ -177,7 +178,7 @@ def _windows(
 
 
 def _least_median(time: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Slope and level of the line through two of the points that half of all are nearest to."""
+    """Slope and level of the line through two points with the least median distance of all."""
     first, second = np.array(list(itertools.combinations(range(len(time)), 2))).T
     slope = (distance[second] - distance[first]) / (time[second] - time[first])
     level = distance[first] - slope * time[first]
@@ -187,8 +188,8 @@ def _least_median(time: np.ndarray, distance: np.ndarray) -> np.ndarray:
 
 
 def _spread(off: np.ndarray) -> float:
-    """Standard deviation of points about their least-median line, spikes among them.
+    """Standard deviation of points about their least-median line; spikes have little effect.
 
-    With Rousseeuw's factor for few points, as the line is the one that flatters them.
+    Rousseeuw's factor corrects for few points, because the line is chosen for a small median.
     """
     return float(TO_DEVIATION * (1 + 5 / (len(off) - 2)) * np.median(off))

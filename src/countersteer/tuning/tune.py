@@ -1,4 +1,4 @@
-"""`tune`: runs in, a car and what it is worth out."""
+"""`tune`: fit a car to runs, and measure its errors."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,29 +23,29 @@ EVERY = {"fitted": 0.5, "judged": 0.25}  # s between the starts of windows
 
 
 class Logs(NamedTuple):
-    """Windows of runs, with the time of each."""
+    """Windows of runs, with their start times (s)."""
 
     runs: list[Run]
-    masked: list[str]  # what was left out or mended, in words
+    masked: list[str]  # a line for each repair and each stretch left out
     shots: Shots
     start: np.ndarray
 
     @property
     def run(self) -> np.ndarray:
-        """The index of each window's run."""
+        """The index of each window's run: (windows,)."""
         return np.asarray(self.shots.run)
 
     def where(self, chosen: np.ndarray) -> "Logs":
-        """Some of the windows."""
+        """The windows that a mask or indices choose."""
         shots = fit.select(self.shots, chosen)
         return self._replace(shots=shots, start=self.start[chosen])
 
     def with_charge(self, charge: np.ndarray) -> "Logs":
-        """With it known how full the battery was in each run."""
+        """The windows with `charge` (runs,) as the known battery charge of their runs."""
         return self._replace(shots=fit.with_charge(self.shots, charge))
 
     def joined(self, other: "Logs") -> "Logs":
-        """With the windows of other runs after these."""
+        """These windows, followed by those of other runs."""
         after = other.shots._replace(run=other.run + len(self.runs))
         return Logs(
             self.runs + other.runs,
@@ -56,9 +56,9 @@ class Logs(NamedTuple):
 
 
 def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: str) -> Logs:
-    """The windows of runs without what is false in them.
+    """The windows of runs without their defects.
 
-    Raises `InputError` naming the run where it cannot be used at all.
+    `every` (s) is the time between two starts. Raises `InputError` if a run is unusable.
     """
     clean, masks, words = [], [], []
     for run in runs:
@@ -79,15 +79,15 @@ def _defect_line(run: Run, defect: LogDefect) -> str:
 
 
 def surface_of(run: Run, cars: Mapping[str, Car], base: str) -> str:
-    """The surface that a run was driven on: the car that its `run.toml` names, or the base."""
+    """The surface of a run: the car that its `run.toml` names if it is in `cars`, else the base."""
     name = str(run.about.get("car_name", base))
     return name if name in cars else base
 
 
 def other_floors(base: str, named: Iterable[str]) -> dict[str, Car]:
-    """The cars that logs name: from beside a base that is a file, or else of the library.
+    """The cars that logs name: a file beside a base file, or else a car of the library.
 
-    A name that is neither is not among them: such a log counts as of the base's own floor.
+    Other names are left out. Their logs count as driven on the base's own floor.
     """
     where = {name: name for name in library()}
     if Path(base).suffix == ".toml":
@@ -96,7 +96,7 @@ def other_floors(base: str, named: Iterable[str]) -> dict[str, Car]:
 
 
 def by_surface(base: str, car: Car, others: Mapping[str, Car]) -> dict[str, Car]:
-    """A car for each surface: the base, with what belongs to the floor from the others."""
+    """A car for each surface: the base, with the parameters of `FLOOR` from the others."""
     cars = {base: car}
     for name, other in others.items():
         cars[name] = car
@@ -113,9 +113,10 @@ def tune(
     validation: Logs | None,
     report: Callable[[str], None],
 ) -> tuple[Result, dict[str, Any], list[tuple[str, Logs]]]:
-    """Fit, and judge on what was not fitted. Returns the fit, its JSON, and the windows by kind.
+    """Fit a car, and measure its errors. Returns the fit, its JSON, and the windows by kind.
 
-    With `hold_out`, blocks of the logs' own time are kept back (`fit.blocks`).
+    With `hold_out`, blocks of the logs' time are held out of the fit (`fit.blocks`). Raises
+    `InputError` if the logs are too short for that.
     """
     began = time.monotonic()
     parts = [("fitted", logs)]
@@ -127,7 +128,7 @@ def tune(
     fitted = parts[0][1]
     thin = fitted.where(thinned(fitted.start, EVERY["fitted"]))
     result = fit.fit(cars, thin.shots, what, report)
-    # What no log tells is taken from the windows that were fitted; of other logs from their own.
+    # A charge that no log states is estimated from the fitted windows; for other logs, from theirs.
     charge = fit.estimated_charge(result.cars, thin.shots)
     parts = [(title, part.with_charge(charge)) for title, part in parts]
     if validation is not None:
@@ -171,14 +172,14 @@ def tune(
 
 
 def thinned(start: np.ndarray, every: float) -> np.ndarray:
-    """Windows at multiples of `every`, and those that start at any other instant (an onset)."""
+    """True for windows that start at multiples of `every` (s), or off the regular grid (onsets)."""
     regular = np.abs(start / EVERY["judged"] - np.rint(start / EVERY["judged"])) < 1e-3
     kept = np.abs(start / every - np.rint(start / every)) < 1e-3
     return kept | ~regular
 
 
 def transient(shots: Shots) -> np.ndarray:
-    """Windows in which the motion changes by as much as `CHANGES`; without capture, the wheels."""
+    """True for windows whose motion changes by more than `CHANGES`; without capture, the wheels."""
     start = np.stack([*shots.velocity], axis=1)[:, :, None]
     change = np.abs(shots.measured[:, :3] - start)
     wheels = np.abs(shots.measured[:, 3] - shots.wheel_speed[:, None])
@@ -190,7 +191,7 @@ def transient(shots: Shots) -> np.ndarray:
 
 
 def judged(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
-    """Errors over some windows, and over those of them in which something changes."""
+    """Errors over the windows, and over the transient ones among them."""
     found = fit.errors(cars, shots)
     lively = transient(shots)
     whole = {"windows": found["windows"], "errors": found["simulated"]}
@@ -222,7 +223,7 @@ def parameter_row(one: Fitted, runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def series(cars: dict[str, Car], parts: Sequence[tuple[str, Logs]]) -> list[dict[str, Any]]:
-    """What a page draws: each run as measured, with the windows simulated in it."""
+    """The series of the page: each run as measured, with its simulated windows."""
     drawn: dict[str, dict[str, Any]] = {}
     for kind, part in parts:
         found = fit.Problem(cars, part.shots, ()).predictions()
@@ -270,7 +271,7 @@ def series(cars: dict[str, Car], parts: Sequence[tuple[str, Logs]]) -> list[dict
 
 
 def residuals(cars: dict[str, Car], logs: Logs, most: int = 3000) -> dict[str, Any]:
-    """Normalised residuals by quantity, at most so many of each."""
+    """Normalised residuals by quantity. Larger sets are thinned to fewer than 2 `most`."""
     found = fit.Problem(cars, logs.shots, ()).predictions()
     result = {}
     for i, quantity in enumerate(QUANTITIES):
@@ -283,7 +284,10 @@ def residuals(cars: dict[str, Car], logs: Logs, most: int = 3000) -> dict[str, A
 
 
 def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Path]:
-    """The cars as files: the first in full, the others beside it with what their floor changes."""
+    """Write the cars as files: the first in full, the others beside it with `FLOOR` alone.
+
+    Returns the files by car.
+    """
     names = list(result.cars)
     files = {names[0]: out} | {name: out.with_name(f"{name}.toml") for name in names[1:]}
     source = {"fit": f"countersteer tune --fit {about['fit']} --car {about.get('car', names[0])}"}
@@ -315,7 +319,7 @@ def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Pa
 
 
 def _errors(total: dict[str, Any]) -> str:
-    """Median errors after a window, as a text."""
+    """Median errors at the ends of windows, as a text."""
     errors = ", ".join(
         f"{quantity} {entry['median_abs_error']:.3f}" for quantity, entry in total["errors"].items()
     )
@@ -323,7 +327,7 @@ def _errors(total: dict[str, Any]) -> str:
 
 
 def table_lines(about: dict[str, Any]) -> list[str]:
-    """What a terminal shows: errors by surface, and the parameters."""
+    """The lines for a terminal: errors by surface, and the parameters."""
     lines = []
     for kind, totals in about["totals"].items():
         for surface, total in totals.items():

@@ -1,8 +1,8 @@
-"""Windows of a log: what was measured in them, and the car simulated over them.
+"""Windows of a log: the measured motion in them, and its simulation.
 
-A window starts from the measured state and runs open loop on the log's own commands. What a log
-holds of the motion is motion capture, the state itself where the run was simulated, or else the
-car's encoder and gyroscope, with lag and quantum.
+A window starts from the measured state and runs open loop on the log's own commands. The measured
+motion is motion capture, or the state itself for a simulated run. Without both, it is the car's
+encoder and gyroscope, with lag and quantum.
 """
 
 import math
@@ -24,34 +24,34 @@ from countersteer.world.chassis import Vector, dot
 from countersteer.world.state import State
 
 QUANTITIES = ("vx_mps", "vy_mps", "yaw_rate_radps", "wheel_speed_mps")
-CHANGES = {"vx_mps": 0.3, "vy_mps": 0.3, "yaw_rate_radps": 1.0}  # that make a window transient
+CHANGES = {"vx_mps": 0.3, "vy_mps": 0.3, "yaw_rate_radps": 1.0}  # beyond, a window is transient
 EVERY = 0.25  # s between the starts of windows
-SLOWEST = 0.2  # m/s from which a window starts
+SLOWEST = 0.2  # m/s, least speed at the start of a window
 
-SMOOTHED_OVER, DEGREE = 0.15, 3  # s and degree of the Savitzky-Golay filter
-GAP = 0.035  # s without motion capture over which nothing is interpolated
+SMOOTHED_OVER, DEGREE = 0.15, 3  # s, width of the Savitzky-Golay filter, and its degree
+GAP = 0.035  # s; longer gaps of motion capture are not interpolated
 
-PIECE = 100  # ticks in a call of the compiled program, whatever the horizon
-SIZES = (1, 32, 256)  # windows simulated at once: few, for each is a program of its own
-ENDS = 0.02  # s for which the first and the last sample of a state stand beyond it
-EARLY = 1e-6  # s by which a command may come early, for times that were rounded
+PIECE = 100  # ticks in each call of the compiled program, for any horizon
+SIZES = (1, 32, 256)  # windows simulated at once; few sizes, as each compiles its own program
+ENDS = 0.02  # s before the first and after the last sample of a signal, in which it still holds
+EARLY = 1e-6  # s by which a command may come early, since times are rounded
 
 
 class Signal(NamedTuple):
-    """Something over time; NaN where it is not known."""
+    """A quantity over time; NaN where unknown."""
 
     time: np.ndarray  # s, rising
     value: np.ndarray
 
     def at(self, time: np.ndarray) -> np.ndarray:
-        """Interpolate; NaN beside what is not known, and beyond the ends but for two samples."""
+        """Interpolate; NaN next to unknown samples, and more than `ENDS` beyond the ends."""
         time = np.where(np.abs(time - self.time[0]) < ENDS, np.maximum(time, self.time[0]), time)
         time = np.where(np.abs(time - self.time[-1]) < ENDS, np.minimum(time, self.time[-1]), time)
         return np.interp(time, self.time, self.value, left=math.nan, right=math.nan)
 
 
 class Timing(NamedTuple):
-    """How late a reading is (s), the time that it is a mean over (s), and its step."""
+    """Lag of a reading (s), its averaging time (s), and its quantum."""
 
     lag: float = 0.0
     over: float = 0.0
@@ -59,12 +59,12 @@ class Timing(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What a log says about the car's motion, in SI units; None where it says nothing."""
+    """The measured motion of a log, in SI units; None: not in the log."""
 
     vx: Signal | None  # with vy and yaw_rate; of the centre of mass in the body's axes
     vy: Signal | None
     yaw_rate: Signal | None
-    wheels: tuple[Signal, ...] | None  # rim speed of the four, known for simulated cars alone
+    wheels: tuple[Signal, ...] | None  # rim speeds of the four, for simulated cars only
     encoder: Signal | None  # as reported
     encoder_timing: Timing
     gyro: Signal | None
@@ -73,16 +73,16 @@ class Measured(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """A quantity that simulated ones are compared with: a state, or readings of a sensor."""
+    """A measured quantity for comparison: a state, or readings of a sensor."""
 
     signal: Signal
     timing: Timing | None = None  # None: a state
 
     def undone(self, time: np.ndarray, resting: np.ndarray | bool = False) -> np.ndarray:
-        """Take the lag off: the quantity itself at these times, as far as the sensor tells.
+        """The quantity at these times, without the sensor's lag.
 
-        Where the car rests until then, the last reading tells more than a line to the next one,
-        which shows what followed. Before the first reading it is that reading; NaN after the last.
+        Where the car rests until then, this is the last reading. Interpolation to the next one
+        would show later motion. Before the first reading, this is the first; NaN after the last.
         """
         times, values = self.signal
         lag = 0.0 if self.timing is None else self.timing.lag
@@ -92,18 +92,18 @@ class Reference(NamedTuple):
 
 
 # -------------------------------------------------------------------------------------------------
-# What was measured
+# Measurement
 # -------------------------------------------------------------------------------------------------
 
 
 def read_measured(run: Run, car: Car) -> Measured:
-    """Body velocities and wheel speeds of a run, and the readings of its sensors."""
+    """Body velocities, wheel speeds and sensor readings of a run."""
     vx = vy = yaw_rate = wheels = None
     truth = run.truth
     if truth is not None and len(truth):
         time = truth["time_s"]
         if {"vx_mps", "vy_mps", "yaw_rate_radps"} <= truth.keys():
-            when = time - float(run.about.get("velocity_lag_s", 0.0))  # as its importer measured
+            when = time - float(run.about.get("velocity_lag_s", 0.0))  # measured by the importer
             vx = Signal(when, truth["vx_mps"])
             vy = Signal(when, truth["vy_mps"])
             yaw_rate = Signal(when, truth["yaw_rate_radps"])
@@ -130,9 +130,9 @@ def read_measured(run: Run, car: Car) -> Measured:
 
 
 def encoder_timing(run: Run, car: Car) -> Timing:
-    """The encoder's, as the run has it in `[sensors.encoder]`, else as the car declares it.
+    """The encoder's timing, from `[sensors.encoder]` of the run, else from the car's declaration.
 
-    The car's encoder counts regions over its update time; so a reading is that of half of it ago.
+    The car's encoder counts regions over its update time. So a reading lags by half of it.
     """
     part = car.sensors.encoder
     over = float(part.update)
@@ -147,12 +147,12 @@ def encoder_timing(run: Run, car: Car) -> Timing:
 
 
 def gyro_timing(run: Run) -> Timing:
-    """The gyroscope's, as the run has it in `[sensors.gyroscope]`, else without a lag."""
+    """The gyroscope's timing, from `[sensors.gyroscope]` of the run, else without a lag."""
     return Timing(run.about.get("sensors", {}).get("gyroscope", {}).get("lag_s", 0.0))
 
 
 def _reported(table: Table, name: str) -> Signal | None:
-    """Take a sensor's readings, without the rows in which it had nothing new."""
+    """A sensor's readings, without rows that have no new one; None if there are none."""
     if name not in table or not np.any(np.isfinite(table[name])):
         return None
     there = np.isfinite(table[name])
@@ -160,7 +160,7 @@ def _reported(table: Table, name: str) -> Signal | None:
 
 
 def radii(car: Car) -> list[Any]:
-    """Give the radius of each wheel (m)."""
+    """The radius of each wheel (m)."""
     front, rear = car.tires.front.radius, car.tires.rear.radius
     return [front, front, rear, rear]
 
@@ -170,8 +170,8 @@ def velocities(
 ) -> tuple[Signal, Signal, Signal]:
     """Forward and lateral velocity (m/s) and yaw rate (rad/s) from poses.
 
-    A cubic Savitzky-Golay filter over 0.15 s on poses resampled evenly; NaN where motion capture
-    paused for longer than `GAP`, and where less than the filter's width of it is left.
+    They are the derivatives by a cubic Savitzky-Golay filter over 0.15 s on evenly resampled poses.
+    They are NaN in gaps longer than `GAP` and 1.5 periods, and in pieces shorter than the filter.
     """
     there = np.isfinite(x + y + heading)
     time, x, y, heading = time[there], x[there], y[there], heading[there]
@@ -199,7 +199,7 @@ def velocities(
 
 
 def find_references(measured: Measured) -> dict[str, Reference]:
-    """Find what the log holds of each quantity."""
+    """The reference of each quantity that the log holds."""
     found: dict[str, Reference] = {}
     if measured.vx is not None and measured.vy is not None and measured.yaw_rate is not None:
         found["vx_mps"] = Reference(measured.vx)
@@ -218,7 +218,7 @@ def find_references(measured: Measured) -> dict[str, Reference]:
 def window_starts(
     measured: Measured, commands: Table, ticks: int, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ticks at which windows of so many ticks may start, and whether the car rests until then."""
+    """Start ticks of windows of `ticks` ticks, and True where the car rests until the start."""
     times = commands["time_s"]
     first, last = float(times[0]), float(times[-1])
     regular = np.arange(math.ceil(first / EVERY) * EVERY, last + EARLY, EVERY)
@@ -235,7 +235,7 @@ def window_starts(
 
 
 def speed_at(measured: Measured, time: np.ndarray, resting: bool) -> np.ndarray:
-    """Give the car's speed, as motion capture or else the encoder tells (m/s)."""
+    """The car's speed (m/s) by motion capture, else by the wheels."""
     if measured.vx is not None and measured.vy is not None:
         return np.hypot(measured.vx.at(time), measured.vy.at(time))
     reference = find_references(measured).get("wheel_speed_mps")
@@ -243,7 +243,7 @@ def speed_at(measured: Measured, time: np.ndarray, resting: bool) -> np.ndarray:
 
 
 def _closed(armed: Signal | None, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Whether the dead-man switch is closed from begin to end."""
+    """True where the dead-man switch is closed from begin to end."""
     if armed is None:
         return np.full(len(begin), True)
     opened = np.concatenate([[0], np.cumsum(armed.value < 0.5)])
@@ -253,17 +253,17 @@ def _closed(armed: Signal | None, begin: np.ndarray, end: np.ndarray) -> np.ndar
 
 
 # -------------------------------------------------------------------------------------------------
-# What is simulated
+# Simulation
 # -------------------------------------------------------------------------------------------------
 
 
 def states_at(
     run: Run, car: Car, measured: Measured, starts: np.ndarray, resting: np.ndarray, dt: float
 ) -> State:
-    """Set up the car at the starts of windows; the leaves have an axis of windows.
+    """The car's states at the starts of windows; the leaves have a leading axis of windows.
 
-    NaN where the velocity was not measured. Wheels: the encoder's speed is the mean of the four,
-    and they differ as their hubs' speeds do; without an encoder they roll.
+    A velocity that was not measured is NaN. The mean speed of the four wheels is the encoder's.
+    They differ as their hubs' speeds do. Without an encoder they roll.
     """
     time = starts * dt
     throttle, steering = asked(run.commands, np.arange(int(starts.max()) + 1), dt)
@@ -283,9 +283,9 @@ def states_at(
 
 
 def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Velocity, yaw rate and the centre of mass's acceleration, in the body's axes, at these times.
+    """Velocity, yaw rate and acceleration of the centre of mass at these times, in the body's axes.
 
-    Without motion capture the car goes as fast as the encoder says and has no lateral velocity.
+    Without motion capture, the forward velocity is the encoder's and the lateral velocity is 0.
     """
     if measured.vx is not None and measured.vy is not None and measured.yaw_rate is not None:
         vx, vy, yaw_rate = (
@@ -303,7 +303,7 @@ def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[
 
 
 def _slope(signal: Signal) -> Signal:
-    """Differentiate; a signal of one sample changes nowhere."""
+    """The derivative of a signal; 0 for a signal of one sample."""
     if len(signal.time) < 2:
         return signal._replace(value=0.0 * signal.value)
     return signal._replace(value=np.gradient(signal.value, signal.time))
@@ -329,9 +329,9 @@ def wheels_at(
 
 
 def rolling(car: Car, velocity: Vector, steering: Scalar, mean: Scalar) -> tuple[Scalar, ...]:
-    """Rim speeds of the four wheels (m/s), of this mean: they differ as their hubs' speeds do.
+    """Rim speeds of the four wheels (m/s) with the given mean. They differ as their hubs' speeds.
 
-    Where the mean is NaN, they roll.
+    Where the mean is NaN, the wheels roll.
     """
     steered = planar.Steered(*servo.directions(car.body, car.servo, steering))
     rolls, _ = planar.contact_directions(car, steered)
@@ -341,7 +341,7 @@ def rolling(car: Car, velocity: Vector, steering: Scalar, mean: Scalar) -> tuple
 
 
 def asked(commands: Table, ticks: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Look up throttle and steering (rad) asked for in these ticks: held; 0 before the first."""
+    """The commanded throttle and steering (rad) in these ticks: held; 0 before the first."""
     last = np.searchsorted(commands["time_s"], ticks * dt + EARLY, side="right") - 1
     held = np.maximum(last, 0)
     return (
@@ -353,12 +353,12 @@ def asked(commands: Table, ticks: np.ndarray, dt: float) -> tuple[np.ndarray, np
 def actuators(
     car: Car, throttle: np.ndarray, steering: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Steering angle (rad) and duty at the begin of each tick, for what is asked from the first on.
+    """Steering angle (rad) and duty at the start of each tick, for the commands of all ticks.
 
-    They do not depend on the car's motion: the laws and delays are those of `planar.step`.
+    They do not depend on the car's motion. The laws and delays are those of `planar.step`.
     """
     state = planar.initial_state(car, dt)
-    # In pieces: one call for a whole log would be compiled for its length, and be slow besides.
+    # In pieces: one call for a whole log would be compiled for its length, and it would be slow.
     missing = -len(throttle) % PIECE
     padded = [np.pad(line, (0, missing), mode="edge") for line in (throttle, steering)]
     traces = []
@@ -375,7 +375,7 @@ def actuators(
 def _actuators(
     car: Car, state: State, counts: jax.Array, throttle: jax.Array, steering: jax.Array, dt: float
 ) -> tuple[State, tuple[jax.Array, jax.Array]]:
-    """Give the state after so many ticks, and steering angle and duty at the begin of each."""
+    """The state after these ticks, and steering angle and duty at the start of each."""
     no_walls = jnp.full((1, 4), jnp.nan)
 
     def tick(state: State, now: tuple[jax.Array, Command]) -> tuple[State, Any]:
@@ -395,9 +395,9 @@ def _actuators(
 def simulate(
     car: Car, states: State, commands: Table, starts: np.ndarray, ticks: int, dt: float
 ) -> dict[str, np.ndarray]:
-    """Each quantity over (windows, ticks + 1), from the start on.
+    """Each simulated quantity from the start on: (windows, ticks + 1).
 
-    Windows are padded to one of `SIZES`, and ticks to whole pieces, so that programs are shared.
+    Windows are padded to one of `SIZES`, and ticks to whole pieces, to reuse compiled programs.
     """
     chunks = []
     for begin in range(0, len(starts), SIZES[-1]):
@@ -420,7 +420,7 @@ def simulate(
 def _advance(
     car: Car, states: State, counts: jax.Array, throttle: jax.Array, steering: jax.Array, dt: float
 ) -> tuple[State, tuple[jax.Array, ...]]:
-    """So many ticks of all windows; throttle and steering are (ticks, windows)."""
+    """The states after some ticks of all windows; throttle and steering are (ticks, windows)."""
     no_walls = jnp.full((1, 4), jnp.nan)
 
     def tick(states: State, now: tuple[jax.Array, Command]) -> tuple[State, Any]:
@@ -433,6 +433,6 @@ def _advance(
 
 
 def quantities_of(car: Car, motion: Motion) -> tuple[Scalar, ...]:
-    """Pick the four quantities; an encoder between the differentials sees the wheels' mean."""
+    """The four quantities; an encoder between the differentials measures the wheels' mean."""
     rims = [radius * spin for radius, spin in zip(radii(car), motion.wheels, strict=True)]
     return motion.vx, motion.vy, motion.yaw_rate, sum(rims) / 4

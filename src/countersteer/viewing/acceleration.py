@@ -10,7 +10,7 @@ _COLUMNS, _PANEL_IN = 5, (2.8, 2.75)
 
 
 def draw_acceleration(found: Acceleration, path: Path) -> None:
-    """Write to `path`, as PNG, each level's speed: measured, and simulated before and after.
+    """Write each level's speed to `path` as PNG: measured, and simulated before and after the fit.
 
     Bars are the reader's standard deviation. An existing file is replaced.
     """

@@ -19,24 +19,24 @@ from countersteer.viewing.style import INK, LINE, PAPER, SOFT
 
 Array = NDArray[np.float64]
 
-FINE = 3  # pixels drawn for each one shown, along either side
+FINE = 3  # drawn pixels for each shown pixel, along each side
 TRAIL_PERIOD = 0.02  # s between two points of the trail
-OVERLAP = 25  # points of the trail that a new piece is drawn over
-MARGIN = 0.35  # around all that is to be seen, lengths of the car
-FOLLOWED = 9.0  # width of what a camera that follows sees, lengths of the car
-PANEL, HEAD, STRIP = 190, 44, 66  # px at a width of 640: panel beside, its head, a strip under
-TALLEST = 110  # px of a strip
+OVERLAP = 25  # points of the old trail that are drawn again with a new piece
+MARGIN = 0.35  # around the scene, in lengths of the car
+FOLLOWED = 9.0  # width of a following camera's view, in lengths of the car
+PANEL, HEAD, STRIP = 190, 44, 66  # px at a width of 640: side panel, its head, a strip below
+TALLEST = 110  # px, largest height of a strip
 GIF_COLOURS = 96
-GIF_TICK = 0.01  # s in which a GIF gives the time of a frame
-PAINT = "#0a7fc2"  # of the car: nothing else has it
+GIF_TICK = 0.01  # s, resolution of a frame's time in a GIF
+PAINT = "#0a7fc2"  # of the car only
 
 
 class Options(NamedTuple):
-    """What is to be drawn, and how."""
+    """What to draw, and how."""
 
     width: int = 640  # px
     fps: float = 20.0
-    speed: float = 1.0  # times as fast as it was
+    speed: float = 1.0  # of playback, over that of the drive
     follow: bool = False  # the camera stays with the car
     begin: float = -math.inf  # s
     end: float = math.inf  # s
@@ -46,27 +46,27 @@ class Strip(NamedTuple):
     """One quantity over time."""
 
     name: str
-    form: str  # how a value is written
+    form: str  # format of a value
     time: Array
     values: Array
     colour: str
 
 
 class Trail(NamedTuple):
-    """The path, so finely that its pieces look smooth."""
+    """The path, with pieces short enough to look smooth."""
 
     time: Array
     points: Array  # (n, 2), m
     colours: list[str]
     wheels: Array  # (4, n, 2) paths of the wheels, m
-    marks: Array  # (4, n) how dark the mark of each tyre is, 0...1
+    marks: Array  # (4, n) darkness of each tyre's mark, 0 to 1
 
 
 class Animation:
     """The frames of a run: `count`, at `moments` (s), of `size` pixels, for `duration` seconds."""
 
     def __init__(self, run: Run, options: Options) -> None:
-        """Raises `InputError` where the run has no path, or none in the time asked for."""
+        """Raises `InputError` if the run has no path, or none in the requested time."""
         if run.truth is None:
             raise InputError(f"{run.path}: has no truth.csv, so there is no path to draw")
         pose = np.column_stack([run.truth[name] for name in ("x_m", "y_m", "heading_rad")])
@@ -115,7 +115,7 @@ class Animation:
         self._font = {n: ImageFont.load_default(n * self._unit) for n in (12, 20)}
 
     def pixel(self, points: Array, pose: Array) -> Array:
-        """Where `points` (..., 2) of the floor are in a frame in which the car is at `pose`."""
+        """The pixels of floor `points` (..., 2) in a frame in which the car is at `pose`."""
         centre = pose[:2] if self.options.follow else self._middle
         return np.array(self._floor) / 2 + (points - centre) * (1, -1) * self._scale
 
@@ -138,7 +138,7 @@ class Animation:
             yield frame
 
     # ---------------------------------------------------------------------------------------------
-    # What there is to draw, and where
+    # Content and layout
     # ---------------------------------------------------------------------------------------------
 
     def _make_trail(self, truth: dict[str, Array], slip: Array | None) -> Trail:
@@ -169,7 +169,7 @@ class Animation:
         return Trail(time, pose[:, :2], colours, wheels, marks)
 
     def _place(self) -> None:
-        """Sizes in pixels, and the scale; the panel beside the floor, or under one that is wide."""
+        """Set sizes in pixels and the scale. The panel is beside the floor, or below a wide one."""
         length = float(self._car.body.length)
         corners = self._walls.reshape(-1, 2)
         seen = self._trail.points
@@ -183,7 +183,7 @@ class Animation:
         self._unit = width / 640
         self._beside = bool(extent[0] < 1.8 * extent[1])
         across = width - round(PANEL * self._unit) if self._beside else width
-        # What is tall and narrow gets no picture that fits on no page, nor a line one of no height.
+        # Bounded, so that a tall picture fits on a page and a straight path has some height.
         high_px = round(across * float(np.clip(extent[1] / extent[0], 0.25, 1.3)))
         under = 0 if self._beside else round((HEAD + STRIP * len(self._strips)) * self._unit)
         self.size = (width, 2 * math.ceil((high_px + under) / 2))
@@ -191,7 +191,7 @@ class Animation:
         self._scale = float(min(np.array(self._floor) / extent))
 
     def _boxes(self) -> list[tuple[int, int, int, int]]:
-        """Left, top, right, bottom of each strip's curve, px in the frame."""
+        """Left, top, right and bottom (px) of each strip's curve in the frame."""
         pad = round(14 * self._unit)
         left = self._floor[0] + pad if self._beside else pad
         top = (0 if self._beside else self._floor[1]) + round(HEAD * self._unit)
@@ -212,7 +212,7 @@ class Animation:
     # ---------------------------------------------------------------------------------------------
 
     def _background(self, pose: Array) -> Image.Image:
-        """Floor, a grid of round lengths, and walls."""
+        """The floor with a grid of round lengths, and walls."""
         image = Image.new("RGB", (FINE * self._floor[0], FINE * self._floor[1]), picture.FLOOR)
         draw = ImageDraw.Draw(image)
         reach = np.array(self._floor) / 2 / self._scale
@@ -234,7 +234,7 @@ class Animation:
         return image
 
     def _draw_trail(self, image: Image.Image, pose: Array, begin: int, end: int) -> None:
-        """Adds the pieces of the trail that end at the points `begin` to `end`."""
+        """Draw the pieces of the trail that end at the points `begin` to `end`."""
         draw, trail = ImageDraw.Draw(image), self._trail
         wheels = self.pixel(trail.wheels, pose)
         points = self.pixel(trail.points, pose)
@@ -245,7 +245,7 @@ class Animation:
                     dark = picture.SKID_DARKEST * (0.25 + 0.75 * float(marks[k]))
                     colour = mixed(picture.FLOOR, INK, dark)
                     self._stroke(draw, track[k - 1 : k + 1], colour, tire)
-        # The rear tyres come over what was drawn of the path before.
+        # Marks of the rear tyres cover earlier pieces of the path. So these are drawn again.
         width = max(1.5, 0.03 * self._scale)
         for k in range(max(1, begin - OVERLAP), end):
             self._stroke(draw, points[k - 1 : k + 1], trail.colours[k], width)
@@ -256,7 +256,7 @@ class Animation:
         draw.line(points, fill=colour, width=max(1, round(width * FINE)))
 
     def _draw_car(self, image: Image.Image, pose: Array, steering: float) -> None:
-        """The body with its windows, and the wheels, the front ones turned by `steering`."""
+        """Draw the body with its windows, and the wheels. The front ones turn by `steering`."""
         draw, body, tires = ImageDraw.Draw(image), self._car.body, self._car.tires
 
         def fill(outline: Array, colour: str) -> None:
@@ -281,7 +281,7 @@ class Animation:
     # ---------------------------------------------------------------------------------------------
 
     def _panels(self) -> tuple[Image.Image, Image.Image]:
-        """The strips with their curves faint, and with their curves in full."""
+        """The strips with faint curves, and with full ones."""
         made = []
         for strength in (0.22, 1.0):
             image = Image.new("RGB", (FINE * self.size[0], FINE * self.size[1]), PAPER)
@@ -308,7 +308,7 @@ class Animation:
     def _draw_panel(
         self, frame: Image.Image, plain: Image.Image, drawn: Image.Image, moment: float
     ) -> None:
-        """Pastes the strips, in full up to `moment`, and writes the values there."""
+        """Paste the strips, with full curves up to `moment`, and write the values at it."""
         draw = ImageDraw.Draw(frame)
         span = max(self.moments[-1] - self.moments[0], 1e-3)
         share = (moment - self.moments[0]) / span
@@ -330,18 +330,18 @@ class Animation:
 
 
 def held(time: Array, given: Array, values: Array) -> Array:
-    """The last of `values` that was given by each time; the first before that."""
+    """The last of `values` given by each time; before the first, the first."""
     return values[np.clip(np.searchsorted(given, time, side="right") - 1, 0, None)]
 
 
 def mixed(one: str, other: str, part: float) -> str:
-    """A colour between two: `part` of the other."""
+    """A colour between two, with `part` (0 to 1) of the other one."""
     pairs = zip(ImageColor.getrgb(one)[:3], ImageColor.getrgb(other)[:3], strict=True)
     return "#" + "".join(f"{round(a + (b - a) * part):02x}" for a, b in pairs)
 
 
 def ramp(part: float) -> str:
-    """The colour of a sideslip that is `part` of the largest, in 32 steps."""
+    """The colour of a sideslip of `part` (0 to 1) of the largest, in 32 steps."""
     calm, middle, wild = picture.SLIP_COLOURS
     place = round(32 * min(part, 1.0)) / 16
     return mixed(calm, middle, place) if place <= 1 else mixed(middle, wild, place - 1)
@@ -351,10 +351,10 @@ Told = Callable[[float, float], None]
 
 
 def export(animation: Animation, path: Path, kind: str, told: Told) -> None:
-    """Writes all frames to `path` as `gif` or `mp4`; `told` hears how many of how many are done.
+    """Write all frames to `path` as `gif` or `mp4`. `told` receives the frames done, and in all.
 
-    The file appears under its name when it is whole. Raises `InputError` where the library for
-    MP4 is missing, `OSError` where the file cannot be written.
+    The file appears under its name when it is complete. Raises `InputError` if the library for MP4
+    is missing, `OSError` if the file cannot be written.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -367,10 +367,10 @@ def export(animation: Animation, path: Path, kind: str, told: Told) -> None:
 
 
 def write_gif(animation: Animation, path: Path, told: Told) -> None:
-    """A GIF that repeats. A frame's time is of whole hundredths of a second, on average right."""
+    """Write a GIF that repeats. Frame times are whole hundredths of a second, exact on average."""
     ticks = np.round(np.arange(animation.count + 1) / animation.options.fps / GIF_TICK)
     times = (np.diff(ticks) * 1000 * GIF_TICK).astype(int).tolist()
-    # One palette for all frames, from the last one: it has the whole trail.
+    # One palette for all frames, from the last one, which has the whole trail.
     palette = next(animation.frames(animation.moments[-1:])).quantize(GIF_COLOURS)
 
     def mapped() -> Iterator[Image.Image]:
@@ -385,7 +385,7 @@ def write_gif(animation: Animation, path: Path, told: Told) -> None:
 
 
 def write_mp4(animation: Animation, path: Path, told: Told) -> None:
-    """An MP4 of H.264 in the colours that every browser plays."""
+    """Write an MP4 in H.264, with a colour format that every browser plays."""
     try:
         import av
     except ImportError:

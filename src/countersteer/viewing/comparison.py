@@ -33,15 +33,14 @@ _NAMES = {
     "yaw_rate_radps": ("Yaw rate, left positive", "rad/s"),
     "wheel_speed_mps": ("Wheel speed", "m/s"),
 }
-_SHOWN_EVERY = 1.0  # s between the windows that are drawn
+_SHOWN_EVERY = 1.0  # s between drawn windows
 _LEFT, _RIGHT, _TOP, _BOTTOM, _CAPTION = 0.055, 0.955, 0.895, 0.065, 0.033  # parts of the figure
 
 
 def draw_comparison(series: Mapping[str, Any], path: Path) -> None:
-    """Write to `path`, as PNG, what `compare` gave as its series: measured against simulated.
+    """Write the series of `compare` to `path` as PNG: measured against simulated.
 
-    Windows are drawn every second at the most, each from its start, marked by a dot. An existing
-    file is replaced.
+    One window a second is drawn at most, with a dot at its start. An existing file is replaced.
     """
     figure, canvas = new_figure(*_SIZE_IN)
     result = series["result"]
@@ -67,7 +66,7 @@ def draw_comparison(series: Mapping[str, Any], path: Path) -> None:
 
 
 def _apart(starts: list[float], least: float) -> list[int]:
-    """Choose windows so that each starts at least so long after the one before."""
+    """The indices of windows whose starts are at least `least` (s) apart."""
     chosen: list[int] = []
     for i, start in enumerate(starts):
         if not chosen or start >= starts[chosen[-1]] + least - EARLY:
@@ -76,7 +75,7 @@ def _apart(starts: list[float], least: float) -> list[int]:
 
 
 def _errors(result: Mapping[str, Any], name: str, unit: str) -> str:
-    """Say both errors of a quantity, beside those of doing nothing."""
+    """Both errors of a quantity as a text, with those of persistence in brackets."""
     if name not in result["rmse"]:
         return ""
     still, errors = result["persistence"], []
@@ -86,7 +85,7 @@ def _errors(result: Mapping[str, Any], name: str, unit: str) -> str:
 
 
 def _write_headline(figure: "Figure", title: str, result: Mapping[str, Any], shown: int) -> None:
-    """Write across the top what is compared, and the key."""
+    """Write the title, the number of windows and the key across the top."""
     from matplotlib.lines import Line2D
 
     figure.text(_LEFT, 0.962, title, color=INK, size=15, weight="bold", va="center")
@@ -123,14 +122,14 @@ def _write_headline(figure: "Figure", title: str, result: Mapping[str, Any], sho
 
 
 def _write_caption(figure: "Figure", top: float, left: str, right: str) -> None:
-    """Write above a strip what it shows, and how well."""
+    """Write the quantity and its errors above a strip."""
     y = top - _CAPTION / 2 - 0.004
     figure.text(_LEFT, y, left, color=INK, size=10.5, weight="bold", va="center")
     figure.text(_RIGHT, y, right, color=SOFT, size=10, va="center", ha="right")
 
 
 def _dress(axes: "Axes", series: Mapping[str, Any], is_last: bool) -> None:
-    """Prepare a strip: the log's time across, grey where the dead-man switch is released."""
+    """Prepare a strip: the log's time axis, grey where the dead-man switch is released."""
     time = series["commands"]["time_s"]
     end = max(float(time[-1]), float(time[0]) + 1e-3)
     axes.set_xlim(float(time[0]), end)
@@ -150,7 +149,7 @@ def _dress(axes: "Axes", series: Mapping[str, Any], is_last: bool) -> None:
 def _predictions(
     series: Mapping[str, Any], name: str, shown: Iterable[int]
 ) -> Iterator[Prediction]:
-    """The windows shown that have the quantity, each from its start."""
+    """The drawn windows that have the quantity, each from its start."""
     for i in shown:
         window: Window = series["windows"][i]
         if name in window:

@@ -1,4 +1,4 @@
-"""What came of an evaluation, as a picture."""
+"""The results of an evaluation, as a picture."""
 
 import math
 from collections.abc import Mapping
@@ -11,9 +11,10 @@ from countersteer.task.judge import Outcome, Score
 
 
 def draw_evaluation(scores: Mapping[str, Score], title: str, path: Path) -> None:
-    """A picture: heading errors and peak sideslip of all turns, and lap times, by driver.
+    """Draw heading errors, peak sideslip and lap times of the successful trials, by driver.
 
-    A turn that ended in the midst of a spin counts to the bin at the end.
+    A value beyond the axes, such as that of a turn that ended in a spin, counts in the outermost
+    bin.
     """
     import matplotlib
 

@@ -1,4 +1,4 @@
-"""Pages that stand alone: templates, the style that they share, and what is filled in."""
+"""Self-contained HTML pages: templates with fields, and their common style."""
 
 import importlib.resources
 import re
@@ -10,7 +10,7 @@ FOLDER = importlib.resources.files("countersteer.viewing")
 def filled(template: str, fields: Mapping[str, str]) -> str:
     """The template with each `{{field}}` replaced, and the common style for `{{style}}`.
 
-    All in one pass: text that looks like a field stays text.
+    All fields are replaced in one pass. So a value that looks like a field stays text.
     """
     known = {"style": (FOLDER / "page.css").read_text(encoding="utf-8").rstrip(), **fields}
     text = (FOLDER / template).read_text(encoding="utf-8")

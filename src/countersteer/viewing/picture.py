@@ -25,7 +25,7 @@ _SIZE_IN = (14.0, 9.0)
 FLOOR = "#fbfaf6"
 WALL, GLASS, _TURN, SPEED = "#39434c", "#303a43", "#f3eee1", "#0069a8"
 _GOOD, _BAD = "#00694f", "#a3210f"
-# From calm to wild. The lightness falls all the way, so the order needs no red and green.
+# From calm to wild. The lightness always falls, so the order is clear without red and green.
 SLIP_COLOURS = ("#a9bac7", "#e39a2b", "#a3210f")
 
 SKID_FROM_MPS, SKID_FULL_MPS = 0.3, 2.0
@@ -52,7 +52,7 @@ _DASHES = (3.0, 2.0)
 
 
 class _Layout(NamedTuple):
-    """Where the parts of the picture are."""
+    """The places of the picture's parts."""
 
     floor: Rectangle
     strips: Rectangle
@@ -65,7 +65,7 @@ _LONG = 2.0
 
 
 def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
-    """Write to `path`, as PNG, the drive `view` (one sample or more) from above and over time.
+    """Write the drive `view` (one sample or more) to `path` as PNG, from above and over time.
 
     The car stands on its path at regular intervals, denser in turns, coloured by its sideslip.
     An existing file is replaced.
@@ -87,7 +87,7 @@ def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
 
 
 def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
-    """Return the lowest and highest x and y of what is to be seen, with a margin."""
+    """Return the lowest and highest x and y of the scene, with a margin."""
     length = view["car"]["length_m"]
     places = np.column_stack([view["x_m"], view["y_m"]])
     corners = np.array(view["walls_m"], dtype=float).reshape(-1, 2)
@@ -97,7 +97,7 @@ def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
 
 
 def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: float) -> None:
-    """Write across the top what was driven and how it ended."""
+    """Write the title, the outcome and the main figures across the top."""
     summary = view["summary"]
     status = str(summary["outcome"])
     figure.text(0.022, 0.955, str(view["title"]), color=INK, size=18, weight="bold", va="center")
@@ -130,7 +130,7 @@ def _draw_floor(
     colours: "Colormap",
     colours_end: float,
 ) -> float:
-    """Draw the drive from above and return how many metres wide the whole figure would be."""
+    """Draw the drive from above, and return the width of the whole figure in its metres."""
     from matplotlib.collections import LineCollection
 
     axes = figure.add_axes(place, facecolor=FLOOR, xticks=[], yticks=[])
@@ -157,7 +157,7 @@ def _draw_floor(
 
 
 def _draw_skid_marks(axes: "Axes", view: dict[str, Any], points_per_metre: float) -> None:
-    """Draw where each wheel slipped, darker where it slipped faster."""
+    """Draw the marks of slipping wheels, darker for faster slip."""
     from matplotlib.collections import LineCollection
 
     stride = math.ceil(len(view["time_s"]) / _MOST_SKID_SAMPLES)
@@ -199,7 +199,7 @@ def _draw_ghosts(
     wheels = [_placed_wheel(view, k, chosen, poses) for k in range(len(car["wheels"]))]
     shapes: list[Array] = []
     faces: list[Any] = []
-    # All in one collection, because what belongs to one car has to lie together in depth.
+    # All in one collection, so that the parts of one car lie together in depth.
     for k, paint in enumerate(paints):
         shapes += [body[k], windscreen[k], rear_window[k], *(wheel[k] for wheel in wheels)]
         faces += [paint, GLASS, GLASS, *(INK for _ in wheels)]
@@ -213,7 +213,7 @@ def _draw_ghosts(
 
 
 def _ghosts(view: dict[str, Any]) -> NDArray[np.intp]:
-    """Return at which samples the car is drawn."""
+    """Return the samples at which the car is drawn."""
     time, poses = np.array(view["time_s"]), _poses(view)
     turns = view["summary"]["turns"]
     length = view["car"]["length_m"]
@@ -238,7 +238,7 @@ def _ghosts(view: dict[str, Any]) -> NDArray[np.intp]:
 
 
 def _number_turns(axes: "Axes", view: dict[str, Any]) -> None:
-    """Write each turn's number on the inside of its middle, while there are not too many."""
+    """Write each turn's number on the inside of its middle, unless there are too many turns."""
     turns = view["summary"]["turns"]
     if len(turns) > _MOST_TURN_NUMBERS:
         return
@@ -267,7 +267,7 @@ def _poses(view: dict[str, Any]) -> Array:
 
 
 def placed(points: Array, poses: Array) -> Array:
-    """Return where `points` of the car (a row each) are on the floor for each pose."""
+    """Return the places of `points` of the car on the floor: (poses, points, 2)."""
     cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
     x, y = points[:, 0], points[:, 1]
     return np.stack([poses[:, :1] + cos * x - sin * y, poses[:, 1:2] + sin * x + cos * y], axis=-1)
@@ -297,7 +297,7 @@ def _draw_keys(
     colours_end: float,
     metres_per_width: float,
 ) -> None:
-    """Draw what the colours mean and how long a metre is, under the floor."""
+    """Draw the key of the colours and the scale bar under the floor."""
     left, bottom, width, _ = floor
     y, right = bottom - 0.027, left + width
     figure.text(left, y, "sideslip  0°", color=SOFT, size=10.5, va="center")
@@ -357,7 +357,7 @@ class _Strip(NamedTuple):
 
 
 def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> None:
-    """Draw what was measured over time, one strip under the other."""
+    """Draw the quantities over time, one strip under the other."""
     strips = (
         _Strip("Speed", "m/s", view["speed_mps"], SPEED),
         _Strip("Sideslip", "°", view["sideslip_deg"], "#c97a10"),
@@ -376,7 +376,7 @@ def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> No
 
 
 def _draw_strip(axes: "Axes", strip: _Strip, view: dict[str, Any], is_last: bool) -> None:
-    """Draw the curves of one strip; only the last one says the time."""
+    """Draw the curves of one strip. Only the last strip has labels on its time axis."""
     time = view["time_s"]
     shown = [0.0, *strip.values, *(strip.command or ())]
     low, high = min(shown), max(shown)
@@ -432,31 +432,31 @@ def _ticks(low: float, high: float, least_step: float) -> list[float]:
 
 
 class Painter:
-    """A process that gets ready to draw while the drive is still computed.
+    """A process that prepares to draw while the drive is still computed.
 
-    Importing Matplotlib takes as long as a short drive. The process ends by itself when this one
-    does, and draws nothing then.
+    Importing Matplotlib takes as long as a short drive. If this program ends early, the process
+    also ends, and draws nothing.
     """
 
     def __init__(self, path: pathlib.Path) -> None:
-        """It will draw to `path`."""
+        """Start the process. It will draw to `path`."""
         self._process = subprocess.Popen(
             [sys.executable, "-m", "countersteer.viewing.picture", str(path)],
             stdin=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            start_new_session=True,  # a Ctrl-C is for the drive alone
+            start_new_session=True,  # Ctrl-C stops the drive only
         )
 
     def draw(self, view: dict[str, Any]) -> None:
-        """`draw_picture`, over there. Raises `OSError` with its reason if it fails."""
+        """Run `draw_picture` in the process. Raises `OSError` with the reason if it fails."""
         _, errors = self._process.communicate(json.dumps(view))
         if self._process.returncode:
             raise OSError(f"the picture was not drawn: {errors.strip().splitlines()[-1]}")
 
 
 if __name__ == "__main__":
-    import matplotlib.figure  # noqa: F401  # while the view is waited for
+    import matplotlib.figure  # noqa: F401  # before the view arrives
 
     text = sys.stdin.read()
     if text:

@@ -8,7 +8,7 @@ import numpy as np
 
 from countersteer.viewing.page import filled
 
-# What the eye can tell apart on the page: more digits would only make it larger.
+# Decimals that are visible on the page. More would only make it larger.
 _DECIMALS = {
     "time_s": 3,
     "x_m": 4,
@@ -25,17 +25,17 @@ _DECIMALS = {
     "throttle": 3,
 }
 _DECIMALS_OF_OTHERS = 4
-# Forces are drawn as parts of the friction limit, so their digits have to follow its size:
-# a toy car pushes with a newton and a real one with thousands.
+# Forces are drawn as parts of the friction limit, so their digits follow its size: a newton for a
+# toy car, thousands of newtons for a real one.
 _FORCES = ("force_x_n", "force_y_n", "limit_n")
 _STEPS_IN_LIMIT = 1000
 
 
 def report_html(view: dict[str, Any]) -> str:
-    """Return the page that plays the drive `view` (one sample or more); it fetches nothing.
+    """Return the page that plays the drive `view` (one sample or more). It loads no other file.
 
-    `view` holds what JSON can hold, and no NaN or infinity (`ValueError` otherwise); it is left
-    unchanged. Text in it is shown as text, whatever it contains.
+    `view` holds JSON data and stays unchanged. Its text is shown as text, whatever it contains.
+    Raises `ValueError` for NaN or infinity.
     """
     compact = {name: _rounded(name, value) for name, value in view.items()}
     compact["wheels"] = [_rounded_wheel(wheel) for wheel in view["wheels"]]
@@ -59,7 +59,7 @@ def _rounded_wheel(wheel: dict[str, Any]) -> dict[str, Any]:
 
 
 def _rounded(name: str, value: Any) -> Any:
-    """Return `value` with every number in it rounded as suits the entry `name` it stands in."""
+    """Return `value` with every number rounded to the decimals of its entry `name`."""
     if isinstance(value, dict):
         return {inner: _rounded(inner, part) for inner, part in value.items()}
     decimals = _DECIMALS.get(name, _DECIMALS_OF_OTHERS)
@@ -73,7 +73,7 @@ def _rounded(name: str, value: Any) -> Any:
 
 
 def _rounded_series(values: list[float], decimals: int) -> list[float]:
-    """Return `values` rounded; a series is where all the numbers are, so numpy does it."""
+    """Return `values` rounded. NumPy does it, since nearly all numbers are in series."""
     # Adding zero turns -0.0 into 0.0, which is shorter.
     rounded: list[float] = (np.round(values, decimals) + 0.0).tolist()
     return rounded

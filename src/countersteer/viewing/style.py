@@ -1,4 +1,4 @@
-"""How pictures look: colours, a figure, and the parts that several of them share."""
+"""The look of pictures: colours, figures, and parts that several pictures share."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,12 +15,12 @@ Numbers = NDArray[np.float64]
 
 PAPER, INK, SOFT, LINE = "#fffefb", "#1b2229", "#5a6570", "#e2ded3"
 MEASURED, SIMULATED, STEERED = "#8796a3", "#c4400f", "#0069a8"
-LABEL, DPI = 9.5, 100  # points; pixels of an inch
+LABEL, DPI = 9.5, 100  # points; pixels per inch
 
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> tuple["Figure", "FigureCanvasAgg"]:
-    """A figure of so many inches, and the canvas that prints it as PNG."""
-    # Matplotlib takes longer to import than the drawing: who draws nothing does not wait for it.
+    """A figure of this size (inches), and the canvas that prints it as PNG."""
+    # Importing Matplotlib takes longer than drawing. Commands that draw nothing do not import it.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -29,7 +29,7 @@ def new_figure(width: float, height: float, dpi: int = DPI) -> tuple["Figure", "
 
 
 def dress(axes: "Axes", size: float = LABEL) -> None:
-    """Axes without a frame, on a light grid."""
+    """Give the axes a light grid and no frame."""
     axes.grid(color=LINE, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.set_frame_on(False)
@@ -47,11 +47,11 @@ class Prediction(NamedTuple):
 def draw_windows(
     axes: "Axes", time: Numbers, measured: Numbers, windows: Iterable[Prediction]
 ) -> None:
-    """A measured quantity, and each window's prediction of it with a dot at its start.
+    """Draw a measured quantity, and each window's prediction of it with a dot at its start.
 
-    The height is that of what is measured within the axes' limits and of the predictions. A
-    prediction may stand out by as much as what is measured spans; if it runs away further, it is
-    cut, so that it does not flatten the rest.
+    The axes' height covers the predictions, and the measured values within the axes' limits. A
+    prediction may go beyond the measured values by their own span. It is cut there, so that it does
+    not flatten the rest.
     """
     axes.plot(time, measured, color=MEASURED, linewidth=2.3, zorder=2)
     begin, end = axes.get_xlim()
@@ -81,7 +81,7 @@ def draw_windows(
 def draw_commands(
     axes: "Axes", time: Numbers, throttle: Numbers, steering: Numbers, size: float = LABEL
 ) -> None:
-    """Throttle (-1 to 1) as % on the left scale, steering (°) on the right one."""
+    """Draw throttle (-1 to 1) as % on the left scale, and steering (°) on the right one."""
     percent = 100 * throttle
     axes.step(time, percent, where="post", color=INK, linewidth=1.3)
     most = max(100.0, float(np.nanmax(np.abs(percent), initial=0.0)))

@@ -1,4 +1,4 @@
-"""What a fit found and how far it can be believed, as one self-contained HTML page."""
+"""The result of a fit and its reliability, as one self-contained HTML page."""
 
 import base64
 import io
@@ -38,7 +38,7 @@ QUANTITIES = {
     "yaw_rate_radps": ("yaw rate", "rad/s"),
     "wheel_speed_mps": ("wheel speed", "m/s"),
 }
-KINDS = {  # of windows, and what they are
+KINDS = {  # of windows, with their description
     "fitted": "windows that were fitted",
     "held out": "of the same runs, not fitted",
     "validation": "of runs that were not fitted",
@@ -48,27 +48,27 @@ MEASURES = {
     "median_abs_error": "median absolute error at the windows’ ends",
     "rmse": "RMS over the windows",
 }
-MANY = 6  # lines from which a list is folded away
+MANY = 6  # lines; a longer list is folded
 CORRELATED = 0.8
 
 _HELD_OUT = "#7a5ba8"
 _WIDTH_IN, _STRIP_IN, _FOOT_IN, _DPI = 11.0, 1.35, 0.45, 120
-_LONGEST = 40.0  # s of a log that are drawn
+_LONGEST = 40.0  # s, longest drawn part of a log
 _MOST_WINDOWS = 40  # in a strip
-_LIMIT, _BINS = 4.0, 32  # of histograms, in scales to either side
+_LIMIT, _BINS = 4.0, 32  # of histograms: range to either side, in scales, and number of bins
 
 
 def write_tuning_page(
     path: Path, result: Mapping[str, Any], series: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Write the page of a tuning to `path`; it fetches nothing, and an existing file is replaced.
+    """Write the page of a tuning to `path`. It loads no other file. An existing file is replaced.
 
-    `result` is what `countersteer tune` gives as JSON. In each of its `parameters`, `low` and
-    `high` may say what was likely beforehand; else that is a factor of e about a positive prior.
-    `new_runs`, if given, says whether the driver should be learned again. `correlations`, if
-    given, are [i, j, r] of parameters by their places. `series` has one entry a run: `quantities`,
-    measured over the whole log and simulated in windows, and `commands`. NaN and None are numbers
-    that are not known. Text is shown as text, whatever it contains.
+    `result` is the JSON of `countersteer tune`. `low` and `high` of a parameter, if given, are its
+    likely range before the fit. Otherwise the range is a factor of e around a positive prior, and
+    for other priors an interval (`_range`). `new_runs`, if given, says whether to learn the driver
+    again. `correlations`, if given, are [i, j, r] with the indices of two parameters. `series` has
+    one entry for each run: `quantities`, measured over the whole log and simulated in windows, and
+    `commands`. NaN and None are unknown numbers. Text is shown as text, whatever it contains.
     """
     title = f"{result['car']}: fit of {result['fit']}"
     unfolded = [f"<li>{escape(line)}</li>" for line in result["masked"]]
@@ -108,7 +108,7 @@ def _numbers(result: Mapping[str, Any]) -> str:
 
 
 def _headline(result: Mapping[str, Any]) -> str:
-    """How good the car is on what was not fitted, and what is not known of it."""
+    """The car's errors on data outside the fit, and its parameters that stay unknown."""
     said = [_said_of_surface(result["totals"], surface) for surface in result["surfaces"]]
     paragraphs = [f'<p class="lead">{words}</p>' for words in said if words]
     if paragraphs:
@@ -140,7 +140,7 @@ def _headline(result: Mapping[str, Any]) -> str:
 
 
 def _said_of_surface(totals: Mapping[str, Any], surface: str) -> str:
-    """Errors on windows of a surface that were not fitted; nothing where there are none."""
+    """Errors on a surface's windows outside the fit; empty if there are none."""
     for kind in UNSEEN:
         scored = totals.get(kind, {}).get(surface)
         if scored and _compared(scored):
@@ -171,7 +171,7 @@ def _said_of_surface(totals: Mapping[str, Any], surface: str) -> str:
 def _compared(
     scored: Mapping[str, Any], measure: str = "median_abs_error"
 ) -> dict[str, tuple[float, float]]:
-    """Error and that of persistence, by quantity, where both are known; in the usual order."""
+    """Error and error of persistence by quantity, where both are known; in the usual order."""
     errors, still = scored.get("errors") or {}, scored.get("persistence") or {}
     pairs = {
         name: (
@@ -197,7 +197,7 @@ def _list_of_errors(scored: Mapping[str, Any]) -> str:
 
 
 def _next_log(text: str) -> str:
-    """A line as a paragraph, several as a list in order."""
+    """One line as a paragraph, several lines as a numbered list."""
     lines = [escape(line) for line in text.splitlines() if line.strip()]
     if len(lines) <= 1:
         return f"<p>{''.join(lines) or 'Not known.'}</p>"
@@ -205,7 +205,7 @@ def _next_log(text: str) -> str:
 
 
 def _folded(items: Sequence[str], none: str) -> str:
-    """A list; folded away where it is long."""
+    """A list, folded if it is long."""
     if not items:
         return f"<p>{none}</p>"
     whole = f"<ul>{''.join(items)}</ul>"
@@ -215,7 +215,7 @@ def _folded(items: Sequence[str], none: str) -> str:
 
 
 def _correlations(result: Mapping[str, Any]) -> str:
-    """The pairs of parameters that these logs hardly tell apart."""
+    """The pairs of parameters that these logs hardly separate."""
     paths = [_named(p) for p in result["parameters"]]
     pairs = sorted(result.get("correlations") or [], key=lambda pair: -abs(pair[2]))
     items = [
@@ -244,7 +244,7 @@ def _named(parameter: Mapping[str, Any]) -> str:
 
 
 def _errors(result: Mapping[str, Any]) -> str:
-    """Errors at the windows' ends; RMS over them is folded away."""
+    """The table of errors at the windows' ends, and a folded one of RMS over the windows."""
     ends, over = (_error_table(result, measure) for measure in MEASURES)
     return (
         f"{ends}<details><summary>The same as {MEASURES['rmse']}</summary>{over}</details>"
@@ -254,7 +254,7 @@ def _errors(result: Mapping[str, Any]) -> str:
 
 
 def _error_table(result: Mapping[str, Any], measure: str) -> str:
-    """A row a quantity, by surface, all windows and transient ones; a column a kind."""
+    """A row for each quantity by surface, in all windows and transient ones; a column by kind."""
     totals = result["totals"]
     kinds = [kind for kind in KINDS if totals.get(kind)]
     rows = []
@@ -298,7 +298,7 @@ def _error_cell(pair: tuple[float, float] | None) -> str:
 
 
 def _parameters(parameters: Iterable[Mapping[str, Any]]) -> str:
-    """Every parameter: what it is, its value and deviation, before and after."""
+    """The table of parameters: meaning, value, deviation and prior."""
     rows = []
     for p in parameters:
         value, deviation, prior = (_float(p[key]) for key in ("value", "deviation", "prior"))
@@ -333,7 +333,7 @@ def _parameters(parameters: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _declaration(path: str) -> Declaration | None:
-    """What the car says about a parameter; None for other names, such as a delay of a sensor."""
+    """The car's declaration of a parameter; None for other names, such as a sensor's delay."""
     *rooms, name = path.split(".")
     try:
         part = reduce(getattr, rooms, Car())
@@ -343,7 +343,7 @@ def _declaration(path: str) -> Declaration | None:
 
 
 def _range(p: Mapping[str, Any], value: float, deviation: float, prior: float) -> str:
-    """A bar from the least to the largest value that was likely, with what was found."""
+    """A bar over the likely range before the fit, with the value found."""
     if not math.isfinite(value):
         return ""
     prior = prior if math.isfinite(prior) else value
@@ -382,13 +382,13 @@ def _range(p: Mapping[str, Any], value: float, deviation: float, prior: float) -
 
 
 def _residuals(residuals: Mapping[str, Mapping[str, Any]]) -> str:
-    """A histogram a channel."""
+    """A histogram for each channel."""
     figures = "".join(_histogram(name, channel) for name, channel in residuals.items())
     return f'<div class="residuals">{figures}</div>' if figures else "<p>None were kept.</p>"
 
 
 def _histogram(name: str, channel: Mapping[str, Any]) -> str:
-    """A channel's residuals as parts a scale, beside the normal density."""
+    """A channel's residuals over its scale, beside the normal density."""
     values = _finite(channel["values"])
     what, unit = QUANTITIES.get(name, (name, ""))
     caption = f"<b>{escape(what)}</b>"
@@ -436,7 +436,7 @@ def _histogram(name: str, channel: Mapping[str, Any]) -> str:
 
 
 def _key() -> str:
-    """What the colours of the figures mean."""
+    """The meaning of the figures' colours."""
     colours = (
         ("measured", "measured"),
         ("simulated", "simulated, fitted"),
@@ -472,7 +472,7 @@ def _run(run: Mapping[str, Any], scored: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _stretch(run: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Begin and end of what is drawn (s), and how long the whole is."""
+    """Start and end of the drawn part (s), and the length of the whole (s)."""
     channels = [(_array(q["time"]), _array(q["measured"])) for q in run["quantities"]]
     times = _finite(
         np.concatenate([*(time for time, _ in channels), _array(run["commands"]["time"])])
@@ -499,7 +499,7 @@ def _stretch(run: Mapping[str, Any]) -> tuple[float, float, float]:
 
 
 def _draw(run: Mapping[str, Any], begin: float, end: float) -> bytes:
-    """The run as PNG: a strip a quantity, and the commands."""
+    """The run as PNG: a strip for each quantity, and one for the commands."""
     strips = len(run["quantities"]) + 1
     height = strips * _STRIP_IN + _FOOT_IN
     figure, canvas = new_figure(_WIDTH_IN, height, _DPI)
@@ -520,7 +520,7 @@ def _draw(run: Mapping[str, Any], begin: float, end: float) -> bytes:
             time, measured = _array(quantity["time"]), _array(quantity["measured"])
             draw_windows(axes, time, measured, _predictions(quantity, begin, end))
             title = ", ".join(QUANTITIES.get(quantity["name"], (str(quantity["name"]),)))
-        # A dollar sign in a name is no formula.
+        # A dollar sign in a name starts no formula.
         axes.set_title(
             title, color=INK, size=9.5, weight="bold", loc="left", pad=4, parse_math=False
         )
@@ -532,7 +532,7 @@ def _draw(run: Mapping[str, Any], begin: float, end: float) -> bytes:
 
 
 def _predictions(quantity: Mapping[str, Any], begin: float, end: float) -> Iterator[Prediction]:
-    """As many windows as can be told apart."""
+    """The drawn windows, few enough to remain distinct."""
     free = begin
     for window in sorted(quantity["windows"], key=lambda window: min(window["time"], default=0.0)):
         at, simulated = _array(window["time"]), _array(window["simulated"])
@@ -567,7 +567,7 @@ def _spread(values: Numbers) -> float:
 
 
 def _digits(value: float, deviation: float) -> tuple[int, int]:
-    """The power of ten to take out of small numbers, and decimals that show the deviation."""
+    """The power of ten to factor out of a small number, and decimals that show the deviation."""
     least = next((x for x in (deviation, abs(value) / 100) if math.isfinite(x) and x > 0), 1.0)
     small = 0 < abs(value) < 1e-3
     power = math.floor(math.log10(abs(value))) if small else 0
@@ -581,5 +581,5 @@ def _fixed(value: float, decimals: int) -> str:
 
 
 def _rough(value: float) -> str:
-    """Two digits."""
+    """A number with two digits."""
     return _fixed(value, min(max(1 - math.floor(math.log10(value)), 0), 4) if value > 0 else 2)

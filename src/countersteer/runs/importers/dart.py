@@ -1,10 +1,10 @@
 """Logs of DART, TU Delft's JetRacer Pro, as run folders.
 
-Two kinds of file are read. The recordings hold what the car reported (held between its updates at
-10 Hz) and, most of them, motion capture beside it at 100 Hz. The processed files hold motion
-capture at 20 Hz with velocities computed from it, and no sensor of the car.
+Two kinds of file are read. Recordings hold the car's reports, held between its updates at 10 Hz.
+Most of them also hold motion capture at 100 Hz. Processed files hold motion capture at 20 Hz, and
+velocities computed from it, but no sensor of the car.
 
-Axes and signs are ours already (ISO 8855: yaw, yaw rate and steering positive to the left).
+Axes and signs need no change (ISO 8855: yaw, yaw rate and steering positive to the left).
 
 Source: https://github.com/Lorenzo-Lyons/DART, MIT licence.
 """
@@ -27,25 +27,25 @@ from countersteer.runs.files import (
 )
 from countersteer.runs.recorder import Recorder, new_folder
 
-FULL_LOCK = 25.0  # degrees of the front wheels that a steering of 1 nominally asks for
+FULL_LOCK = 25.0  # degrees, nominal angle of the front wheels at a steering of 1
 
-# The captured point from the centre of mass, m, and the captured yaw's error, rad. 0.0220 is the
-# published 0.115 m from the rear axle less the 0.0930 m that the axle loads give. The point is to
-# the right: so the authors' code has it, and so do the logs. In steady circles the encoder reads
-# 0.997 of the point's speed to the left (at 0.89 of yaw rate over speed) and 1.039 to the right
-# (at 1.85), which a point 8 mm to the right explains and one to the left does not.
+# The captured point from the centre of mass (m), and the error of the captured yaw (rad). 0.0220 is
+# the published 0.115 m from the rear axle, less 0.0930 m from the axle loads. The point is on the
+# right, by the authors' code and by the logs. In steady circles to the left (yaw rate over speed
+# 0.89), the encoder reads 0.997 of the point's speed; to the right (1.85), it reads 1.039. A point
+# 8 mm to the right explains this. A point to the left does not.
 POINT_X, POINT_Y = 0.0220, -0.01
-YAW_ERROR = 0.0077  # added to the captured yaw; the sideslip of slow circles then is 0 on average
+YAW_ERROR = 0.0077  # added to the captured yaw; then the mean sideslip of slow circles is 0
 
-FASTEST, FASTEST_YAW = 10.0, 60.0  # m/s, rad/s; a frame that would need more is a false one
-DIGITS = 6  # of a second that times keep
+FASTEST, FASTEST_YAW = 10.0, 60.0  # m/s, rad/s; a frame that needs more is false
+DIGITS = 6  # decimals of times (s)
 
-# Lags of the car's sensors, from the instant to the row in which a reading first appears, measured
-# against motion capture on the four recordings that have it. The gyroscope's is sharp (rms 0.07
-# rad/s at 0.05 s, 0.16 to 0.41 at 0.09 s). The encoder's is that of straight driving in grip (rms
-# 0.024 m/s at 0.055 s, 0.08 at 0.13 s), about half of the 0.1 s over which it counts. Others report
-# 0.09 s and 0.11 to 0.15 s: those are of the columns as they stand in the file, which hold each
-# reading for 0.1 s and so are 0.05 s later on average.
+# Lags of the car's sensors, from the instant to the first row with the reading. They were measured
+# against motion capture, on the four recordings that have it. The gyroscope's optimum is sharp: rms
+# 0.07 rad/s at 0.05 s, 0.16 to 0.41 at 0.09 s. The encoder's is from straight driving within grip:
+# rms 0.024 m/s at 0.055 s, 0.08 at 0.13 s. It is about half of the 0.1 s over which it counts.
+# Others report 0.09 s, and 0.11 to 0.15 s, for the columns as they are in the file. These hold each
+# reading for 0.1 s, so they are 0.05 s later on average.
 SENSORS = {
     "encoder": {"lag_s": 0.06, "over_s": 0.1, "step_mps": 0.0413},
     "gyroscope": {"lag_s": 0.05},
@@ -65,18 +65,18 @@ YAW = "unwrapped yaw"
 
 
 class Log(NamedTuple):
-    """What a log says, in our units; times from its first row on."""
+    """The content of a log; times start at its first row."""
 
     kind: str
-    updates: Table  # safety_value, throttle, steering, and what the car reported, with time_s
+    updates: Table  # safety_value, throttle, steering and the car's reports, with time_s
     telemetry: dict[str, np.ndarray]  # columns of telemetry.csv, besides time and armed
     truth: dict[str, np.ndarray] | None
     repairs: dict[str, int]
 
 
-# The library's car by folder of the published logs; `jetracer`, on the rubber floor, where none is
-# given. The throttle ramps are told to be of the taped tyres too, but they are not: they corner at
-# 6.0 m/s² where the circles with tape end at 3.6, in the same hours.
+# The library's car by folder of the published logs. Other folders have `jetracer`, on the rubber
+# floor. The throttle ramps are published as driven on taped tyres too, but they were not: they
+# corner at 6.0 m/s². Circles with tape, recorded in the same hours, end at 3.6.
 CARS = {
     "circles_tape_and_tiles": "jetracer-tape",
     "drift_tape_and_tiles": "jetracer-tape",
@@ -86,14 +86,15 @@ CARS = {
 
 
 def import_dart(log: Path, out: Path) -> dict[str, Any]:
-    """Write a DART log as the run folder `out`/<name of the log> and say what was done.
+    """Write a DART log as the run folder `out`/<name of the log>. Returns a report for JSON.
 
-    The files are `commands.csv` (a row per update of the car; the throttle that the motor got,
-    which is 0 while the dead-man switch is released; steering times a nominal lock of 25 degrees),
-    `telemetry.csv` (with `armed`, 1 while the switch is closed), `truth.csv` where there is motion
-    capture (moved to the centre of mass, heading unwrapped), and `run.toml`.
+    - `commands.csv`: a row for each update of the car. The throttle is the motor's: 0 while the
+      dead-man switch is released. The steering is scaled by a nominal lock of 25 degrees.
+    - `telemetry.csv`: the sensors, and `armed`, which is 1 while the switch is closed.
+    - `truth.csv`, with motion capture only: moved to the centre of mass, heading unwrapped.
+    - `run.toml` and `run.mcap`.
 
-    Raises `InputError` with one line where the file is not a DART log or is damaged.
+    Raises `InputError` if the file is not a DART log or is damaged.
     """
     table = _read(log)
     if CLOCK in table:
@@ -147,7 +148,7 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
 
 
 def _read(log: Path) -> Table:
-    """Read the columns of a log. Raises `InputError` where there is no row."""
+    """Read the columns of a log. Raises `InputError` if it has no rows or is no CSV file."""
     try:
         table = read_table(log, ())
     except csv.Error:
@@ -160,10 +161,10 @@ def _read(log: Path) -> Table:
 
 
 def _recording(log: Path, table: Table) -> Log:
-    """Read a recording: the car's updates, and motion capture where its columns are there.
+    """Read a recording: the car's updates, and motion capture if it has the columns.
 
     The rows come at the rate of motion capture and hold the car's last update. So an update's time
-    is that of the row in which it first appears. It is 0 in the rows before the first one.
+    is that of its first row. In the rows before the first update, the car's clock is 0.
     """
     captured = "vicon time" in table
     _check(log, table, (CLOCK, *ONBOARD, *ASKED, *(CAPTURE if captured else ())))
@@ -189,7 +190,7 @@ def _recording(log: Path, table: Table) -> Log:
 
 
 def _captured(table: Table) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Motion capture at the centre of mass, and how many frames were dropped for what."""
+    """Motion capture at the centre of mass, and the numbers of dropped frames and heading wraps."""
     time = np.round(table["vicon time"] - table["vicon time"][0], DIGITS)
     x, y, yaw = (table[name] for name in CAPTURE[1:])
     pose = np.stack([x, y, yaw])
@@ -215,9 +216,10 @@ def _captured(table: Table) -> tuple[dict[str, np.ndarray], dict[str, int]]:
 def _possible(
     time: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray, candidates: np.ndarray
 ) -> np.ndarray:
-    """Those candidates that the car could have reached from the one kept before.
+    """True for candidates that the car can have reached from the last one kept.
 
-    What is allowed grows with the time since then, so that a false start heals.
+    The limit grows with the time since that one. So a false first frame does not exclude all later
+    ones.
     """
     kept = np.zeros(len(time), bool)
     last = int(np.argmax(candidates))
@@ -235,15 +237,15 @@ def _processed(log: Path, table: Table) -> Log:
 
     Checked on the four files: the velocities are central differences of `vicon x`, `vicon y` and
     `unwrapped yaw` over two rows, turned by `unwrapped yaw` into ISO 8855 axes, to the last digit.
-    The point is the centre of mass (slow and in grip, lateral velocity is 0.097 m times the yaw
-    rate, as at 0.093 m ahead of the rear axle), and `unwrapped yaw` has its error taken out.
+    The point is the centre of mass, 0.093 m ahead of the rear axle: at low speed within grip, the
+    lateral velocity is 0.097 m times the yaw rate. `unwrapped yaw` has no error left.
     """
     _check(log, table, ("vicon time", "vicon x", "vicon y", YAW, *ASKED, *PROCESSED))
     _rises(log, table, "vicon time")
     new = np.diff(table["vicon time"], prepend=-math.inf) > 0
     updates = _rows(table, new, table["vicon time"])
     velocity = {ours: updates[theirs] for theirs, ours in PROCESSED.items()}
-    # Where no difference could be taken, the authors' code writes zeros, and nothing else is one.
+    # The authors' code writes zeros where it has no difference. No other velocities are zero.
     unknown = np.all([column == 0 for column in velocity.values()], axis=0)
     truth = {
         "time_s": updates["time_s"],
@@ -257,13 +259,13 @@ def _processed(log: Path, table: Table) -> Log:
 
 
 def _rows(table: Table, chosen: np.ndarray, time: np.ndarray) -> Table:
-    """Take the chosen rows, with their time since the log's first row."""
+    """The chosen rows, with their time since the log's first row."""
     columns = {name: column[chosen] for name, column in table.items()}
     return Table(columns | {"time_s": np.round(time[chosen] - time[0], DIGITS)})
 
 
 def _check(log: Path, table: Table, columns: tuple[str, ...]) -> None:
-    """Raise `InputError` where a column is missing, holds no number, or a command is too large."""
+    """Raise `InputError` for a missing column, a cell that is no number, or too large a command."""
     line = _line(log)
     for name in columns:
         if name not in table:
@@ -274,10 +276,10 @@ def _check(log: Path, table: Table, columns: tuple[str, ...]) -> None:
 
 
 def _rises(log: Path, table: Table, clock: str) -> None:
-    """Raise `InputError` where a clock goes backwards."""
+    """Raise `InputError` if a clock goes backwards."""
     require(_line(log), np.diff(table[clock], prepend=-math.inf) >= 0, f"{clock} goes backwards")
 
 
 def _line(log: Path) -> Callable[[int], str]:
-    """Says where a row is: the header is line 1."""
+    """A function that gives the place of a row. The header is line 1."""
     return lambda row: f"{log}, line {row + 2}"

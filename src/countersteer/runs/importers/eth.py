@@ -1,10 +1,10 @@
 """Logs of the RC car of ETH Zürich's Learning and Adaptive Systems group, as run folders.
 
-A file holds one recording: `obs` (N, 12) with x, y (m), heading (rad), velocity in the world's axes
-(m/s), yaw rate (rad/s) and the last three pairs of steering and throttle, oldest first; `action`
-(N, 2) with the pair that was asked for on that row's observation. So a command belongs to its
-row's own time and holds until the next row; the newest pair in the buffer is the row before's.
-Axes and signs are ours already (ISO 8855), and the point is published as the centre of mass.
+A file holds one recording. `obs` (N, 12) has x, y (m), heading (rad), velocity in the world's axes
+(m/s), yaw rate (rad/s), and a buffer of the last three pairs of steering and throttle, oldest
+first. `action` (N, 2) has the pair commanded on that row's observation. So a command belongs to the
+time of its row and holds until the next row. The newest pair in the buffer is that of the row
+before. Axes and signs need no change (ISO 8855). The point is published as the centre of mass.
 
 Source: https://github.com/lasgroup/simulation_transfer, MIT licence.
 """
@@ -19,39 +19,41 @@ from countersteer.errors import InputError
 from countersteer.runs.files import COMMANDS, require
 from countersteer.runs.recorder import Recorder, new_folder
 
-FULL_LOCK = 36.0  # degrees of the front wheels that a steering of 1 nominally asks for
+FULL_LOCK = 36.0  # degrees, nominal angle of the front wheels at a steering of 1
 
-# s between two rows. The loop asks for 30 Hz, but distance moved over speed logged gives 33.4 (on
-# straights) to 33.7 ms; in one row of a hundred a frame came 10 ms late, which is not undone.
+# s between two rows. The loop asks for 30 Hz, but distance over logged speed gives 33.4 (on
+# straights) to 33.7 ms. In one row of a hundred, a frame came 10 ms late. This is not corrected.
 PERIOD = 0.0336
-# s by which velocities and yaw rate are behind the poses: the middle of the frames that they were
-# computed from, by least squares against differences of poses. Said in run.toml, not undone.
+# s, lag of velocities and yaw rate behind the poses. They belong to the middle of the frames that
+# they were computed from. The lag is by least squares against differences of poses. It is written
+# to run.toml, and not corrected.
 VELOCITY_LAG = 0.015
 
-FASTEST_YAW = 12.0  # rad/s; beyond, the yaw rate was taken across a wrap of the heading
+FASTEST_YAW = 12.0  # rad/s; a higher yaw rate was computed across a wrap of the heading
 LARGEST_FILE = 256  # MB, unpacked
 OBSERVED, ASKED = 12, 2  # columns
 
 
 def import_eth(log: Path, out: Path) -> dict[str, Any]:
-    """Write an ETH log as the run folder `out`/<name of the log> and say what was done.
+    """Write an ETH log as the run folder `out`/<name of the log>. Returns a report for JSON.
 
-    The files are `commands.csv` (a row each; throttle as logged, its sign the direction; steering
-    times a nominal lock of 36 degrees), `truth.csv` (velocity turned into the body's axes, heading
-    unwrapped; rows whose state the next one repeats are left out, false yaw rates are empty),
-    `run.toml`, `run.mcap`.
+    - `commands.csv`: a row for each row of the log. The throttle is as logged; its sign is the
+      direction. The steering is scaled by a nominal lock of 36 degrees.
+    - `truth.csv`: velocity in the body's axes, heading unwrapped. A row is left out if the next one
+      repeats its state. False yaw rates are empty.
+    - `run.toml` and `run.mcap`.
 
-    Raises `InputError` with one line where the file is not an ETH log or is damaged.
+    Raises `InputError` if the file is not an ETH log or is damaged.
     """
     observed, asked = _read(log)
     time = np.round(PERIOD * np.arange(len(observed)), 6)
     x, y, yaw, east, north, yaw_rate = observed[:, :6].T
     cosine, sine = np.cos(yaw), np.sin(yaw)
-    # The row after a wrap is still computed across it in part, if by less than is impossible.
+    # The row after a wrap is still computed partly across it, but stays below `FASTEST_YAW`.
     wrapped = np.abs(yaw_rate) > FASTEST_YAW
     wrapped[1:] |= wrapped[:-1].copy()
-    # Of two rows with one state the first stands a period early: the distance to the row before it
-    # is that of two periods, and that to the row behind them of one.
+    # Of two rows with one state, the first is a period early: the distance to the row before is
+    # that of two periods, and the distance to the row after is that of one.
     repeated = np.zeros(len(time), bool)
     repeated[:-1] = np.all(np.diff(observed[:, :6], axis=0) == 0, axis=1)
     truth = {
@@ -94,9 +96,9 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
 
 
 def _read(log: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Observations and actions, checked. Nothing in the file is executed: arrays of numbers only.
+    """Read observations and actions. Nothing in the file is executed: arrays of numbers only.
 
-    Raises `InputError` with one line.
+    Raises `InputError` if they are not as in the module's description.
     """
     try:
         with zipfile.ZipFile(log) as packed:
