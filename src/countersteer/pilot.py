@@ -3,7 +3,7 @@
     readings ──► estimator ──► Estimate ─┐
         └───────────────── ages ─────────┴─► driver ──► command
 
-It knows the nominal car and the course, and never the world: a batch runs it, a real car can.
+It knows the nominal car and the course, but not the world. A batch runs it, and a real car can.
 """
 
 import dataclasses
@@ -28,18 +28,19 @@ from countersteer.errors import InputError
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.estimator import Estimator
 from countersteer.estimation.registry import ESTIMATORS
+from countersteer.kept_programs import kept
 from countersteer.link.link import LINKS, ONBOARD, Link
 from countersteer.random_streams import Stream
 from countersteer.signals import Array, Command, Reading, Readings, Scalar
 
-PYTHON_PERIOD = 0.005  # s between two decisions of a driver in plain Python, unless it has its own
+PYTHON_PERIOD = 0.005  # s, default time between two decisions of a driver in plain Python
 
 
-LOCKS = (-math.pi / 2, math.pi / 2)  # rad, that a car can be asked to steer
+LOCKS = (-math.pi / 2, math.pi / 2)  # rad, range of a steering command
 
 
 class PilotMemory(NamedTuple):
-    """What the pilot carries from one decision to the next."""
+    """The pilot between two decisions."""
 
     estimate: Any  # the estimator's
     driver: Any
@@ -50,15 +51,15 @@ class PilotMemory(NamedTuple):
 class Pilot:
     """An estimator and a driver with their periods.
 
-    `init` and `act` are pure. A driver that is no pytree is called from Python: `act` then has a
-    compiled part of its own, and cannot be traced.
+    `init` and `act` are pure. A driver that is no pytree is called from Python. Then JAX cannot
+    trace `act`, and only its estimator is compiled.
     """
 
     estimator: Estimator
     driver: Any  # a `Driver`
     dt: float = dataclasses.field(metadata={"static": True})  # s, a tick of the clock
-    control: int = dataclasses.field(default=1, metadata={"static": True})  # ticks by decision
-    estimating: int = dataclasses.field(default=1, metadata={"static": True})  # by update
+    control: int = dataclasses.field(default=1, metadata={"static": True})  # ticks a decision
+    estimating: int = dataclasses.field(default=1, metadata={"static": True})  # ticks an update
 
     @classmethod
     def of(
@@ -70,7 +71,7 @@ class Pilot:
         link: Link = ONBOARD,
         dt: float = 0.001,
     ) -> "Pilot":
-        """For a course and the nominal car, which is all that the pilot knows of the real one.
+        """For a course and the nominal car. The pilot knows nothing else of the real car.
 
         `estimate` names one of `estimation.registry.ESTIMATORS`.
         """
@@ -80,7 +81,7 @@ class Pilot:
     def with_estimator(
         cls, driver: Driver, estimator: Estimator, link: Link = ONBOARD, dt: float = 0.001
     ) -> "Pilot":
-        """With an estimator of one's own. Decisions come at the link's pace, or the driver's."""
+        """With your own estimator. Decisions come at the link's pace, or slower by the driver's."""
         period = link.control_period
         if not traceable(driver):
             period = max(period, float(getattr(driver, "period", PYTHON_PERIOD)))
@@ -99,7 +100,7 @@ class Pilot:
         return traceable(self.driver)
 
     def typed(self, dtype: Any) -> "Pilot":
-        """The same, estimating in a precision."""
+        """The same pilot, with its estimator in this precision."""
         real = np.dtype(dtype).type
         estimator: Estimator = jax.tree.map(
             lambda leaf: real(leaf) if _is_real(leaf) else leaf, self.estimator
@@ -108,15 +109,15 @@ class Pilot:
 
     @property
     def dtype(self) -> Any:
-        """The precision that it estimates in."""
+        """The precision of the estimator."""
         reals = [leaf for leaf in jax.tree.leaves(self.estimator) if _is_real(leaf)]
         return np.dtype(getattr(reals[0], "dtype", np.float64) if reals else np.float64)
 
     def rerun(self, seed: int, readings: Readings, ticks: Array) -> Command:
-        """What it asks for at the ticks (n,) of its decisions: it needs no car for that.
+        """The commands of its decisions at the ticks (n,), without a car.
 
-        Leaves of `readings` have an axis of n in front; `seed` is the drive's. JAX must be able to
-        trace it.
+        Leaves of `readings` have a leading axis of n. `seed` is the drive's. JAX must be able to
+        trace the pilot (`traced`).
         """
         dtype = self.dtype
         with jax.enable_x64(dtype == np.float64):
@@ -137,8 +138,8 @@ class Pilot:
     ) -> tuple[Command, PilotMemory]:
         """The command from this tick on, and the memory after it.
 
-        Called from Python it is compiled. Raises `InputError` where a driver in Python returns
-        something else than it should.
+        A call from Python runs compiled code. Raises `InputError` if a driver in Python returns a
+        wrong value (`checked`).
         """
         if isinstance(tick, jax.core.Tracer):
             return _act(self, memory, readings, tick)
@@ -156,7 +157,7 @@ class Pilot:
     def observe(
         self, memory: PilotMemory, readings: Readings, tick: Scalar
     ) -> tuple[Any, Observation]:
-        """The estimator's memory at this tick, and what the driver is told."""
+        """The estimator's memory at this tick, and the driver's observation."""
         told = readings if self.estimator.takes_truth else readings._replace(truth=None)
 
         def update(estimate: Any) -> Any:
@@ -180,7 +181,7 @@ class Pilot:
         return estimate, Observation(*(self.dt * tick.astype(dtype), *ages, known))
 
     def estimate(self, memory: PilotMemory) -> Estimate:
-        """What the estimator believes since its last update. Called from Python it is compiled."""
+        """The estimate after the last update. A call from Python runs compiled code."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(memory.estimate)):
             return self.estimator.estimate(memory.estimate)
         with jax.enable_x64(self.dtype == np.float64):
@@ -188,7 +189,7 @@ class Pilot:
             return jax.tree.map(np.asarray, found)
 
     def status(self, memory: PilotMemory) -> Status:
-        """What the driver says it is about."""
+        """The status that the driver reports."""
         return status_of(self.driver, memory.driver)
 
 
@@ -215,7 +216,7 @@ def _act(
     return after.command, after
 
 
-_compiled_init, _compiled_act = jax.jit(_init), jax.jit(_act)
+_compiled_init, _compiled_act = kept()(_init), jax.jit(_act)
 _compiled_observe = jax.jit(Pilot.observe)
 _compiled_estimate = jax.jit(lambda estimator, memory: estimator.estimate(memory))
 
@@ -230,9 +231,10 @@ def _rerun(pilot: Pilot, root: jax.Array, readings: Readings, ticks: Array) -> C
 
 
 def pilot_of_run(about: Mapping[str, Any], read: Read) -> Pilot:
-    """The pilot of a `run.toml`. `read` reads a `commands.csv`, where a plan names one.
+    """The pilot of a `run.toml`. `read` reads a `commands.csv` that a plan names.
 
-    Raises `InputError` where the driver was no plain data, such as one in Python.
+    Raises `InputError` without a nominal car or a course, for the estimator `truth` or an unknown
+    one, and if the driver was not plain data, such as one in Python.
     """
     course = course_of_run(dict(about))
     if not isinstance(about.get("nominal"), dict) or course is None:
@@ -254,7 +256,7 @@ def traceable(driver: Any) -> bool:
 
 
 def checked(driver: Any, answer: Any) -> tuple[Command, Any]:
-    """What `act` of a driver in Python returned. Raises `InputError` where it is wrong."""
+    """The checked result of a Python driver's `act`. Raises `InputError` if it is wrong."""
     name = f"{type(driver).__name__}.act"
     # A command alone is a pair as well.
     if isinstance(answer, Command) or not isinstance(answer, tuple) or len(answer) != 2:
@@ -277,24 +279,24 @@ def checked(driver: Any, answer: Any) -> tuple[Command, Any]:
 
 
 def bounded(command: Command) -> Command:
-    """What a car can be asked for: throttle in ±1, steering within a right angle."""
+    """The command within its limits: throttle in ±1, steering in ±90°."""
     return Command(jnp.clip(command.throttle, -1.0, 1.0), jnp.clip(command.steering, *LOCKS))
 
 
 def _is_real(leaf: Any) -> bool:
-    """Whether a leaf holds real numbers: no count, and no key."""
+    """Whether a leaf holds real numbers, not counts or keys."""
     if isinstance(leaf, float):
         return True
     return bool(jnp.issubdtype(getattr(leaf, "dtype", np.int32), jnp.floating))
 
 
 def _typed(leaf: Any, dtype: Any) -> Any:
-    """A driver's number with a type of its own: that of the car, or a 32-bit integer."""
+    """A driver's Python number in the given precision, or as a 32-bit integer."""
     if isinstance(leaf, bool | int):
         return np.int32(leaf)
     return dtype.type(leaf) if isinstance(leaf, float) else leaf
 
 
 def _like(new: Any, old: Any) -> Any:
-    """What a driver or an estimator gave, with the type that the loop carries."""
+    """A new value of driver or estimator, with the type of the old one, as a loop needs."""
     return jnp.asarray(new, jnp.result_type(old))

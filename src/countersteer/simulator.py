@@ -24,6 +24,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Status
+from countersteer.kept_programs import kept
 from countersteer.link.link import ONBOARD, Link, Packets, exchange, initial_packets
 from countersteer.pilot import Pilot, PilotMemory
 from countersteer.random_streams import Stream
@@ -304,7 +305,7 @@ def tick(
     return loop, memory, record._replace(status=status)
 
 
-@partial(jax.jit, static_argnums=2)
+@kept(2)
 def scan(
     simulator: Simulator, pilot: Pilot, ticks: int, loop: Loop, memory: PilotMemory
 ) -> tuple[Loop, PilotMemory, Record]:

@@ -1,4 +1,4 @@
-"""Where along a course: poses on the centre line, in arithmetic that JAX can trace."""
+"""Places along the centre line of a course, in arithmetic that JAX can trace."""
 
 import math
 from typing import Any, NamedTuple
@@ -9,11 +9,12 @@ import numpy as np
 from countersteer.course.course import Course, place
 from countersteer.signals import Array, Scalar
 
-FAR = 1e3  # m to the end of the last leg
+FAR = 1e3  # m, length of the last leg
+TABLE = 128  # rows, or a multiple: courses share programs, and long tables are read faster
 
 
 class Place(NamedTuple):
-    """A place seen from the centre line; distances of a closed course are not wrapped."""
+    """A place relative to the centre line. Distances of a closed course are not wrapped."""
 
     distance: Scalar  # along the line, m
     offset: Scalar  # to the left of the line, m
@@ -28,25 +29,25 @@ class Line(NamedTuple):
     length: Array  # (n,)
     mark: Array  # (n,) distance of the beginning
     whole: Scalar  # length of the line, or inf where it is open
-    near: Scalar  # m along the line between two poses that follow each other, at most
+    near: Scalar  # largest way along the line between consecutive poses, m
     start: Scalar  # distance of the course's start
 
     def follow(self, x: Scalar, y: Scalar, last: Scalar) -> Place:
-        """As `course.progress`: the nearest place of the line not far from the last distance."""
+        """The nearest place of the line within `near` of the last distance (`course.progress`)."""
         return self._nearest(x, y, last, self.near)
 
     def find(self, x: Scalar, y: Scalar, last: Scalar) -> Place:
-        """As `follow`; but where that is off the corridor, the nearest place of all.
+        """As `follow`; but if that place is over `near` / 2 aside, the nearest one of all.
 
-        For a believed pose, which jumps when another is believed. Of a closed course's rounds it
-        is in the one nearest to the last.
+        It is for an estimated pose, which may jump. On a closed course the distance is in the round
+        nearest to the last distance.
         """
         followed, any_place = (self._nearest(x, y, last, near) for near in (self.near, math.inf))
         strays = jnp.abs(followed.offset) > self.near / 2
         return Place(*(jnp.where(strays, a, f) for a, f in zip(any_place, followed, strict=True)))
 
     def _nearest(self, x: Scalar, y: Scalar, last: Scalar, near: Scalar) -> Place:
-        """The nearest place at most `near` along the line from the last, or else the last."""
+        """The nearest place at most `near` along the line from `last`. Without one, `last`."""
         dx, dy = x - self.begin[:, 0], y - self.begin[:, 1]
         on = jnp.clip(dx * self.along[:, 0] + dy * self.along[:, 1], 0.0, self.length)
         aside_x, aside_y = dx - on * self.along[:, 0], dy - on * self.along[:, 1]
@@ -63,7 +64,7 @@ class Line(NamedTuple):
         )
 
     def at(self, distance: Scalar) -> tuple[Scalar, Scalar]:
-        """Where the line is at a distance (x, y); beyond the ends of an open course straight on."""
+        """Point (x, y) of the line at a distance; straight on beyond the ends of an open course."""
         wrapped = jnp.where(jnp.isinf(self.whole), distance, jnp.mod(distance, self.whole))
         piece = jnp.clip(jnp.searchsorted(jnp.asarray(self.mark), wrapped, side="right") - 1, 0)
         on = wrapped - jnp.asarray(self.mark)[piece]
@@ -75,19 +76,19 @@ class Line(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """The course as straights from corner point to corner point: one leg to each turn, one behind.
+    """The course as straights between corner points: a leg to each turn, and one after the last.
 
-    A rounded corner has its point where the straights beside it would meet.
+    The point of a rounded corner is where the straights beside it would meet.
     """
 
-    x: Array  # (turns + 1,) of the corner point that ends the leg, m; that of the last is far
+    x: Array  # (legs,) of the corner point at a leg's end, m; the last one is far
     y: Array
     bearing: Array  # unwrapped from the start's, rad
 
     def seen(self, leg: Scalar, x: Scalar, y: Scalar, heading: Scalar) -> Place:
-        """A pose from a leg: distance to its corner (m), offset, and how far it is turned (rad).
+        """A pose relative to a leg: distance to its corner (m), offset (m) and angle (rad).
 
-        For `bearing` the place has the car's angle to the leg, in ±pi, to the left.
+        `Place.bearing` holds the car's angle to the leg, in ±pi, positive to the left.
         """
         bearing = jnp.asarray(self.bearing)[leg]
         cosine, sine = jnp.cos(bearing), jnp.sin(bearing)
@@ -95,6 +96,12 @@ class Legs(NamedTuple):
         error = heading - bearing
         error = error - 2 * math.pi * jnp.round(error / (2 * math.pi))
         return Place(-(cosine * dx + sine * dy), cosine * dy - sine * dx, error)
+
+
+def as_table(values: np.ndarray, filling: float) -> np.ndarray:
+    """Values (n,), filled up to a whole number of `TABLE` rows."""
+    rows = math.ceil(len(values) / TABLE) * TABLE
+    return np.append(values, np.full(rows - len(values), filling))
 
 
 def line_of(course: Course, dtype: Any = np.float64) -> Line:
@@ -118,11 +125,11 @@ def legs_of(course: Course, laps: int) -> Legs:
     corners = []
     x, y, bearing = place(course, course.start_distance) if len(course.line) else course.start
     for turn in course.turns_ahead(laps):
-        # From where the arc begins, on along the straight before it.
+        # From the beginning of the arc, straight on to the corner point.
         x, y, _ = place(course, turn.distance - abs(turn.angle) * turn.radius / 2)
         ahead = turn.radius * math.tan(abs(turn.angle) / 2)
         x, y = x + ahead * math.cos(bearing), y + ahead * math.sin(bearing)
         corners.append((x, y, bearing))
         bearing += turn.angle
     corners.append((x + FAR * math.cos(bearing), y + FAR * math.sin(bearing), bearing))
-    return Legs(*np.array(corners).T)
+    return Legs(*(as_table(column, column[-1]) for column in np.array(corners).T))

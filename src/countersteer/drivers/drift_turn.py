@@ -11,6 +11,7 @@ import numpy as np
 from countersteer.car.car import Car, Lidar
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
+from countersteer.course.position import FAR, as_table
 from countersteer.drivers import policy, straighten
 from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.drivers.stop_angle import StopAngle
@@ -21,41 +22,41 @@ from countersteer.estimation import lidar_walls
 from countersteer.signals import Array, Command, Scalar
 
 STRAIGHT, SPIN, STOP, SETTLE = 0, 1, 2, 3
-SPEED = 2.0  # m/s, unless another is asked for
-NEWS = 0.03  # m, standard deviation of what the front sonar says of the corner's distance
-DOUBT = 0.2  # m, standard deviation of that distance as a corridor begins
-SLIPPING = 0.12  # m/s, by which odometry may be off: what the doubt grows by in a second
+SPEED = 2.0  # m/s, default
+NEWS = 0.03  # m, standard deviation of the corner's distance by the front sonar
+DOUBT = 0.2  # m, standard deviation of the estimated distance as a corridor begins
+SLIPPING = 0.12  # m per root second: growth of that deviation, by odometry
 GATE = 3.0  # standard deviations beyond which a reading is a spike
-FOLLOWS, STEADY = 0.15, 2  # m from one reading to the next at most, and how often in a row
-RESTS = (0.17, 1.0)  # sideslip and yaw rate (rad/s) under which a linked turn may follow
-AGREE, INSIST = 0.08, 6  # m within which so many of them in a row agree, and are no spikes
+FOLLOWS, STEADY = 0.15, 2  # steady readings: largest change (m), and number of changes in a row
+RESTS = (0.17, 1.0)  # |vy / vx| and yaw rate (rad/s), below which a linked turn may begin
+AGREE, INSIST = 0.08, 6  # m within which odd readings agree; so many in a row are no spikes
 
 
 class DriftTurnMemory(NamedTuple):
-    """What the driver is about."""
+    """The driver between two decisions."""
 
     phase: Scalar
     turn: Scalar  # turns begun
     since: Scalar  # when the phase began, s
-    entry: Scalar  # speed at which the turn was begun, m/s
+    entry: Scalar  # speed at the turn's beginning, m/s
     hand: Scalar  # of the turn: 1 left, -1 right
     calm: Scalar  # s for which the car has gone straight
     corner: Scalar  # distance along the corridor to the next corner, m
-    doubt: Scalar  # its variance, m²
-    heard: Scalar  # the front sonar's last reading, m
-    odd: Scalar  # by how much the last that was not believed differed, m
-    odds: Scalar  # how many in a row agreed on that
-    follows: Scalar  # how many readings in a row followed the one before
+    doubt: Scalar  # variance of `corner`, m²
+    heard: Scalar  # last reading of the front sonar, m
+    odd: Scalar  # `corner` by the last usable reading, less the corrected `corner`, m
+    odds: Scalar  # unexpected readings in a row that agree
+    follows: Scalar  # readings in a row that differ little from the one before
     straight: straighten.StraightenMemory
 
     @property
     def time(self) -> Scalar:
-        """Of the last thought (s)."""
+        """Time of the last decision (s)."""
         return self.straight.time
 
     @property
     def command(self) -> Command:
-        """The last."""
+        """The last command."""
         return self.straight.command
 
 
@@ -63,20 +64,22 @@ class DriftTurnMemory(NamedTuple):
 class DriftTurn:
     """Straightens; turns the wheels over before the corner; turns them back in time.
 
-    When the wheels turn over is told by the distance to the corner, which the front sonar and the
-    encoder tell; or (`by` "pose"), where the corners are so round that no wall stands ahead, the
-    pose estimate. Then it tells offset and angle to the corridor too, as side sonars mislead in a
-    curve; corridors are for it the straights from corner point to corner point. At each tick of the
-    turn the driver asks how far the car would still turn if it were stopped now (`stop_angle`), and
-    stops when that is what is left of the target. Targets are headings of corridors, so a turn's
-    error is the next one's to mend (`carry`, by the wall); without that they are counted from the
-    heading at which the turn was begun.
+    The distance to the corner decides when the wheels turn over. With `by` "wall", front sonar and
+    encoder give it. `by` "pose" is for corners so round that no wall stands ahead. The pose
+    estimate then gives the distance. It also gives offset and angle to the corridor, as side sonars
+    mislead in a curve. Corridors are then the straights from corner point to corner point.
+
+    At each tick of the spin the driver predicts how far the car still turns if stopped now
+    (`stop_angle`). It stops the turn when this is the angle that is left to the target.
+
+    Targets are headings of corridors, so the next turn corrects a turn's error. With `carry` 0, a
+    target counts from the heading at the turn's beginning. `carry` has no effect by "pose".
     """
 
     straight: Straighten
     turning: Turning
     stop_angle: StopAngle
-    angles: Array  # of the turns in their order, rad; 0 behind the last
+    angles: Array  # of the turns in their order, rad; 0 after the last
     gaps: np.ndarray  # distance along the centre line to each turn from the one before, m
     front_x: Scalar  # mount of the front sonar, m
     front_axle: Scalar
@@ -84,14 +87,14 @@ class DriftTurn:
     cone: Scalar  # half-angle of the front sonar's cone, rad
     front: int = dataclasses.field(metadata={"static": True})
     by: str = dataclasses.field(default="wall", metadata={"static": True})
-    lidar: Lidar | None = None  # where the car has one, it looks for the corner instead
-    carry: Scalar = 1.0  # part of a turn's error that is carried into the next one's target
-    linked: Scalar = 0.0  # 1: a turn begins as soon as the slide of the last ends, walls or not
-    longest: Scalar = 1.2  # s that a phase of a turn may take
+    lidar: Lidar | None = None  # if the car has one, it replaces the front sonar
+    carry: Scalar = 1.0  # part of a turn's error that the next turn corrects
+    linked: Scalar = 0.0  # 1: a turn begins when the last slide ends, wherever the walls are
+    longest: Scalar = 1.2  # s, longest phase of a turn
     phases = ("straight", "spin", "stop", "settle")
 
     def reset(self, key: jax.Array) -> DriftTurnMemory:
-        """Straight ahead, a corridor's length away from the first corner."""
+        """Straight ahead, `gaps[0]` before the first corner."""
         gap = jnp.asarray(self.gaps)[0]
         first = (STRAIGHT, 0, 0.0, 0.0, 1.0, 0.0, gap, DOUBT**2, math.inf, 0.0, 0, 0)
         return DriftTurnMemory(*first, self.straight.reset(key))
@@ -103,12 +106,12 @@ class DriftTurn:
         return paced(self.think, memory, observation)
 
     def status(self, memory: DriftTurnMemory) -> Status:
-        """The turn and its phase, and where it believes to be in its corridor."""
+        """The turn, its phase, and the estimated place in the corridor."""
         told = self.straight.status(memory.straight)
         return told._replace(turn=memory.turn, phase=memory.phase, doubts=memory.odds)
 
     def think(self, memory: DriftTurnMemory, seen: Observation) -> tuple[Command, DriftTurnMemory]:
-        """The command from now on, and the memory with what is new."""
+        """The command from now on, and the memory after this decision."""
         now, own = seen.time, self.turning
         dt = now - memory.time
         straight = self.straight.follow(memory.straight, seen)
@@ -188,14 +191,18 @@ class DriftTurn:
     def _approach(
         self, memory: DriftTurnMemory, seen: Observation, error: Scalar, angle: Scalar, dt: Scalar
     ) -> tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]:
-        """Distance to the next corner and its variance: odometry, and the wall ahead.
+        """Distance to the next corner and its variance, by odometry and the wall ahead.
 
-        The wall behind a corner by an angle a stands w/2 beyond it, its normal turned by 90° - a
-        from the heading: from a distance c before the corner it is c sin a + w/2 away, and an
-        echo comes from within the cone, so from as much farther as the cone is short of the normal.
-        A reading that odometry does not expect is a spike, until several in a row agree; one that
-        stands still while the car moves tells nothing, nor does one that leaps: of many spikes some
-        would be expected. One that follows those before and is expected is believed at once.
+        The third value holds the new `heard`, `odd`, `odds` and `follows`. With `straight.by`
+        "pose", the pose gives the distance.
+
+        The wall behind a corner by an angle a is w/2 beyond it. Its normal is 90° - a off the
+        heading. So it is c sin a + w/2 away from a sonar that is c before the corner. If the cone
+        is short of the normal by an angle b, the echo comes from 1 / cos b times as far.
+
+        A reading that odometry does not expect is a spike, until `INSIST` in a row agree. A reading
+        that repeats while the car moves is ignored. So is one that leaps: of many spikes, some
+        match by chance. A steady and expected reading is believed at once.
         """
         along = seen.estimate.vx * jnp.cos(error) - seen.estimate.vy * jnp.sin(error)
         corner = memory.corner - dt * along
@@ -248,13 +255,12 @@ def drift_turn(
 ) -> DriftTurn:
     """For a course and a nominal car; `speed` (m/s) is what it brings to a turn.
 
-    Laws that are not given are those of the library's policy. `straight_by` is what it straightens
-    by, as in `Straighten`. `by`, what tells where a corner is, is "wall" or "pose"; by default what
-    the roundest corner asks for. Where the centre line's radius R is over half the width w,
-    the wall ahead stands oblique by more than asin(R / (R + w/2)) = 30°, and is no longer where
-    that of a mitred corner would be.
+    Laws that are not given are those of the library's policy. `straight_by` is the `by` of
+    `Straighten`. `by` is that of `DriftTurn`. Its default is "pose" if the centre line's radius R
+    in any corner is over half the width w, else "wall". In such a corner the wall ahead is oblique
+    by more than asin(R / (R + w/2)) = 30°, and not where a mitred corner would have it.
 
-    Raises `InputError` where a closed course has no corners, as those of centre lines and maps.
+    Raises `InputError` for a closed course without corners, such as a centre line or a map.
     """
     turns = course.turns_ahead(laps)
     if course.closed and not turns:
@@ -274,8 +280,8 @@ def drift_turn(
         ),
         turning=turning or policy.library().turning,
         stop_angle=stop_angle or policy.library().stop_angle,
-        angles=np.array([t.angle for t in turns] + [0.0]),
-        gaps=np.append(np.diff(marks), [1e3, 1e3]),
+        angles=as_table(np.array([t.angle for t in turns] + [0.0]), 0.0),
+        gaps=as_table(np.append(np.diff(marks), [FAR, FAR]), FAR),
         front_x=sonar.mounts[front].x,
         front_axle=car.body.front_axle,
         width=width,

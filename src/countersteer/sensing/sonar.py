@@ -5,7 +5,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import KDTree
 
 from countersteer.car.car import Sonar
 from countersteer.signals import Scalar
@@ -13,6 +12,7 @@ from countersteer.signals import Scalar
 PAST = 1e-5  # rad by which a ray passes the end of a wall
 INSIDE = 1e-3  # m, margin between an echo's point and the end of a wall
 MERGED = 1e-4  # m, distance within which ends of walls are one corner
+FEW = 1000  # points whose distances are all computed
 MOST_WALLS = 24  # walls of a ping: the nearest ones in its cone
 
 
@@ -28,10 +28,21 @@ def edges(walls: np.ndarray) -> np.ndarray:
     scatters = np.ones(len(ends), bool)
     real = np.nonzero(np.all(np.isfinite(ends), axis=1))[0]
     if len(real):
-        one, other = real[KDTree(ends[real]).query_pairs(MERGED, output_type="ndarray")].T
+        one, other = real[_near_pairs(ends[real])].T
         seams = np.sum(along[one] * along[other], axis=1) < -0.999
         scatters[one[seams]] = scatters[other[seams]] = False
     return np.concatenate([ends, scatters[:, None]], axis=1).astype(walls.dtype)
+
+
+def _near_pairs(points: np.ndarray) -> np.ndarray:
+    """(pairs, 2): indices of points (n, 2) within `MERGED` of each other."""
+    if len(points) <= FEW:
+        near = np.sum((points[:, None] - points) ** 2, axis=-1) <= MERGED**2
+        return np.argwhere(np.triu(near, 1))
+    from scipy.spatial import KDTree  # it takes a quarter of a second to import
+
+    pairs: np.ndarray = KDTree(points).query_pairs(MERGED, output_type="ndarray")
+    return pairs
 
 
 def distances(

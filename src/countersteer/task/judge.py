@@ -1,7 +1,7 @@
-"""`Task`: a course to be driven to its goal, and the judge of it.
+"""`Task`: a course to be driven to its goal, and the judge of the drive.
 
-Written once, for one sample of one drive: a recorded drive is a `scan` over its samples, a batch
-is `vmap`. Whoever drives, and whatever records, is judged alike: by motion and course.
+The judge takes one sample of one drive. A `scan` over samples judges a recorded drive, a `vmap` a
+batch. It uses motion and course alone, so all drivers and recordings are judged alike.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ import numpy as np
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.course.position import Line, line_of
+from countersteer.kept_programs import kept
 from countersteer.signals import Array, Motion, Scalar
 from countersteer.task import turns as turning
 from countersteer.task.turns import (
@@ -28,12 +29,12 @@ from countersteer.task.turns import (
 )
 
 PERIOD = 0.005  # s between two samples that are judged, as in truth.csv
-STALLED = 5.0  # s without a step ahead
-STEP = 0.05  # m that count as one
+STALLED = 5.0  # s without progress, after which a drive has stalled
+STEP = 0.05  # m that count as progress
 
 
 class Outcome(Enum):
-    """How a drive stands, or has ended: messages for people. Arrays hold their `code`."""
+    """State or end of a drive. The values are messages for people; arrays hold the `code`."""
 
     DRIVING = "driving"
     REACHED = "goal reached"
@@ -43,11 +44,11 @@ class Outcome(Enum):
     LOST = "lost its state"
     LATE = "out of time"
     INTERRUPTED = "interrupted"
-    DONE = "done"  # there was no goal, and nothing went wrong
+    DONE = "done"  # without a goal, and without a failure
 
     @property
     def code(self) -> int:
-        """Its number."""
+        """The number of the outcome."""
         return list(Outcome).index(self)
 
     @classmethod
@@ -57,17 +58,17 @@ class Outcome(Enum):
 
 
 class Sample(NamedTuple):
-    """What the judge looks at."""
+    """A sample of a drive, as the judge needs it."""
 
     time: Scalar  # s
     motion: Motion
     wall_contacts: Scalar
     rolled_over: Scalar
-    turn: Scalar = 0  # turns that the driver says it has begun: recorded, and nothing else
+    turn: Scalar = 0  # turns begun, by the driver's own account: only recorded
 
 
 class Score(NamedTuple):
-    """A drive so far."""
+    """The result of a drive so far."""
 
     outcome: Scalar  # the code of an `Outcome`
     distance: Scalar  # along the centre line, m
@@ -84,11 +85,11 @@ class Score(NamedTuple):
 
 @pytree
 class Task:
-    """To drive a course from start to goal, so many laps where it is closed.
+    """To drive a course from start to goal, or for a number of laps if it is closed.
 
-    A drive that has reached its goal goes on until the turn that it is in, if any, has ended.
-    Where `walls_end` it ends with the first touch of a wall. Without a goal it ends when it must.
-    One `of_log` may rest as long as it likes, and its place is found again after a gap.
+    After the goal, a drive goes on until a turn under way has ended. With `walls_end` it ends at
+    the first touch of a wall. Without a goal it ends only by a failure. With `of_log` it may rest
+    without limit, and its place is found again after a gap.
     """
 
     line: Line | None  # the centre line; None: there is no goal
@@ -102,7 +103,7 @@ class Task:
     def of(
         cls, course: Course | None, laps: int = 1, walls_end: bool = False, dtype: Any = np.float64
     ) -> "Task":
-        """For a course, in a precision."""
+        """For a course, in a precision. Without a goal, `walls_end` has no effect."""
         number = np.dtype(dtype).type
         if course is None or course.goal_distance is None:
             none = Corners(*[np.zeros(0, dtype)] * 4)
@@ -125,7 +126,7 @@ class Task:
         return Score(outcome, *at, never, *turning.before_any(count, dtype))
 
     def update(self, score: Score, sample: Sample) -> Score:
-        """The score with one sample more; a drive that is over stays as it is."""
+        """The score after one more sample. The score of a drive that has ended stays."""
         time, motion = sample.time, sample.motion
         distance, finite = score.distance, jnp.isfinite(motion.x + motion.vx + motion.yaw_rate)
         if self.line is not None:
@@ -178,16 +179,16 @@ class Task:
     def follow(self, score: Score, samples: Sample) -> tuple[Score, np.ndarray]:
         """The score after a piece of a drive, and the outcome at each of its samples.
 
-        Leaves of `samples` have an axis of samples in front; they are taken in 64 bits.
+        Leaves of `samples` have a leading axis of samples. They are converted to 64 bits.
         """
-        # Where there is another device, a loop that is being computed is not waited for.
+        # On another device, if there is one, this need not wait for a loop under computation.
         with jax.enable_x64(True), jax.default_device(jax.devices()[-1]):
             wide = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), samples)
             score, outcomes = _follow(self, score, wide)
             return jax.tree.map(np.asarray, score), np.asarray(outcomes)
 
 
-@jax.jit
+@kept()
 def _follow(task: Task, score: Score, samples: Sample) -> tuple[Score, Array]:
     def step(score: Score, sample: Sample) -> tuple[Score, Scalar]:
         score = task.update(score, sample)
@@ -197,7 +198,7 @@ def _follow(task: Task, score: Score, samples: Sample) -> tuple[Score, Array]:
 
 
 def summary(score: Score, outcome: Outcome) -> dict[str, Any]:
-    """The JSON of a drive that ended so."""
+    """The JSON of a drive with this outcome."""
     completed = outcome in (Outcome.REACHED, Outcome.DONE)
     contacts = int(score.wall_contacts)
     return {

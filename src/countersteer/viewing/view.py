@@ -1,4 +1,4 @@
-"""What report and picture of a run are made from, read off the run's own files."""
+"""The data for a run's report and picture, from the run's own files."""
 
 import math
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 
 from countersteer.car.car import GRAVITY, Car, wheel_positions
 from countersteer.errors import InputError
+from countersteer.kept_programs import kept
 from countersteer.runs.run import Run, drawn_car
 from countersteer.signals import Array, Motion, Wheels
 from countersteer.task.turns import sideslip
@@ -16,14 +17,17 @@ from countersteer.world import planar
 from countersteer.world.floor import Floor, floor_of_run
 
 PERIOD = 0.01  # s between two samples, at least
-ROWS = 1024  # whose forces are computed at once: always as many, so that there is one program
+ROWS = 1024  # in each computation of forces; a fixed number, so that there is one program
 UNJUDGED = {"outcome": "not judged", "completed": False, "wall_contacts": 0, "turns": []}
 WHEELS = ("fl", "fr", "rl", "rr")
 MOTION = ("vx_mps", "vy_mps", "yaw_rate_radps", "steering_rad")
 
 
 def view_of(run: Run) -> dict[str, Any]:
-    """Plain lists, units in the names. Raises `InputError` where the run has no poses."""
+    """The view of a run: plain lists, with units in the names.
+
+    Raises `InputError` if the run has no `truth.csv`, or one without a simulated car's columns.
+    """
     if run.truth is None or len(run.truth) == 0:
         raise InputError(f"{run.path}: has no truth.csv to draw")
     for name in (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS)):
@@ -70,14 +74,14 @@ def view_of(run: Run) -> dict[str, Any]:
 
 
 def warm_up(car: Car, floor: Floor | None = None) -> None:
-    """Compiles what a view of such a run needs, so that it is there when the drive is over."""
+    """Compile the program for a view of such a run, so that it is ready when the drive ends."""
     still = planar.initial_state(car, 1e-3, slots=1).motion
     motion = jax.tree.map(lambda leaf: np.zeros(1) + leaf, still)
     wheel_views(car, motion, floor, slice(None))
 
 
 def echoes(run: Run, car: Car) -> list[dict[str, Any]]:
-    """What each sonar reported, and when."""
+    """The reports of each sonar, with their times (s)."""
     sonar, found = car.sensors.sonar, []
     for name, mount in zip(sonar.mount_names, sonar.mounts, strict=True):
         table: Any = run.telemetry or {}
@@ -98,10 +102,10 @@ def echoes(run: Run, car: Car) -> list[dict[str, Any]]:
 
 
 def motions(run: Run, car: Car) -> Motion:
-    """The motion at each row of `truth.csv`; the loads follow the acceleration that rows tell.
+    """The motion at each row of `truth.csv`. The loads follow the acceleration between rows.
 
-    A hit on a wall is no acceleration that a tyre has brought about: what is beyond friction is
-    left out, as the planar world does.
+    The acceleration is limited to what friction allows. A hit on a wall exceeds that, but it is no
+    force of a tyre. The planar world leaves it out too.
     """
     table = run.truth
     assert table is not None
@@ -131,7 +135,7 @@ def motions(run: Run, car: Car) -> Motion:
 def wheel_views(
     car: Car, motion: Motion, floor: Floor | None, every: slice
 ) -> list[dict[str, list[float]]]:
-    """The forces at each wheel, in its own axes."""
+    """The forces at each wheel, in the wheel's own axes."""
     thin = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[every], motion)
     count, blocks = len(thin.x), []
     with jax.enable_x64(False):
@@ -153,7 +157,7 @@ def wheel_views(
     ]
 
 
-@jax.jit
+@kept()
 def _forces(car: Car, floor: Floor | None, motion: Motion) -> Array:
     forces = jax.vmap(lambda one: planar.forces(car, one, floor))(motion)
     return jax.tree.map(lambda leaf: leaf + jnp.zeros_like(motion.x), forces)
