@@ -71,7 +71,7 @@ class Kept:
     def _program(self, arguments: Sequence[Any], leaves: list[Any], tree: Any) -> "_Program | None":
         types = tuple(_type(leaf) for leaf in leaves)
         static = tuple(arguments[i] for i in sorted(self.static))
-        signature = (tree, types, static, jnp.result_type(float))
+        signature = (tree, types, static, jnp.result_type(float), _device())
         with self._lock:
             if signature not in self._programs:
                 self._programs[signature] = self._find(arguments, leaves, tree, types, static)
@@ -128,7 +128,7 @@ class _Program:
 
     def __init__(self, exported: Any, tree: Any) -> None:
         # Without a named device, JAX compiles again for the results of a call before.
-        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        here = jax.sharding.SingleDeviceSharding(_device())
         self.tree = tree
         self.run = jax.jit(exported.call, in_shardings=here, out_shardings=here)
 
@@ -166,6 +166,11 @@ def _type(leaf: Any) -> tuple[Any, ...]:
     if jnp.issubdtype(dtype, jax.dtypes.extended):  # a key
         return (np.shape(leaf), str(dtype))
     return (np.shape(leaf), str(jax.dtypes.canonicalize_dtype(dtype)))
+
+
+def _device() -> Any:
+    """The device that JAX computes on now."""
+    return getattr(jax.config, "jax_default_device", None) or jax.devices()[0]
 
 
 def _strong(leaf: Any) -> Any:

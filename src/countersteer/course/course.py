@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -73,46 +74,38 @@ class Course:
         return [t for t in ahead if self.start_distance < t.distance < (end or 0.0)]
 
 
+class Segment(NamedTuple):
+    """A piece of a corridor's centre line."""
+
+    kind: str  # straight, from corner point to corner point; length, of its own; turn
+    value: float  # m, or rad to the left
+    radius: float = 0.0  # m
+
+
 def from_segments(
     name: str,
     width: float,
     closed: bool,
-    segments: list[tuple[str, float, float]],
+    segments: Sequence[Segment | tuple[str, float, float]],
     start: tuple[float, float, float] = (0.0, 0.0, 0.0),
     goal: float | None = None,
+    crosses: bool = False,
 ) -> Course:
-    """A corridor. `segments` holds ("straight", length, 0) and ("turn", angle, radius).
+    """A corridor along a centre line of straights and turns.
 
-    Straights run between the corner points of the centre line. A radius rounds the corner, and a
-    radius of 0 mitres it. `start` is distance, offset to the left, heading relative to the line.
-    `goal` is a distance: by default that of the end, or a lap after the start if closed.
-    Raises `InputError` if the segments do not make a corridor.
+    A "straight" runs between the corner points of the centre line, where the straights beside a
+    turn would meet; a "length" is a straight's own length. A radius rounds a turn; a radius of 0
+    mitres it. `start` is distance, offset to the left, heading relative to the line. `goal` is a
+    distance: by default that of the end, or a lap after the start if closed. With `crosses` the
+    line may cross itself, and no wall stands within the corridor there.
+    Raises `InputError` if the segments do not make a corridor, and says what to write instead.
     """
-    corners, angles, radii = [np.zeros(2)], [0.0], [0.0]
-    heading, turn, radius, fresh = 0.0, 0.0, 0.0, True
-    for kind, value, bend in segments:
-        if kind == "turn":
-            if turn or fresh:
-                raise InputError(f"{name}: a turn must stand between two straights")
-            turn, radius = value, bend
-            continue
-        if not fresh:
-            angles.append(turn)
-            radii.append(radius)
-        heading += turn
-        corners.append(corners[-1] + value * np.array([math.cos(heading), math.sin(heading)]))
-        turn, radius, fresh = 0.0, 0.0, False
-    if len(corners) < 2:
-        raise InputError(f"{name}: a course needs a straight")
-    if closed:
-        if (
-            np.hypot(*(corners[-1] - corners[0])) > 1e-6
-            or abs(math.remainder(heading + turn, 2 * math.pi)) > 1e-6
-        ):
-            raise InputError(f"{name}: closed = true, but the segments do not come back to start")
-        angles[0], radii[0] = turn, radius
-    points, turns = _rounded(name, np.array(corners), angles, radii, closed)
+    points, turns = _centre_line(name, [Segment(*s) for s in segments], closed)
     walls = np.concatenate([_offset(points, closed, side * width / 2) for side in (1, -1)])
+    if not crosses:
+        _require_simple(name, points, closed)
+    else:
+        walls = _opened(name, points, closed, width)
     course = Course(name, width, closed, points, walls, turns, (0.0, 0.0, 0.0), start[0], None)
     length = course.length
     if not 0 <= start[0] <= length:
@@ -157,47 +150,117 @@ def walls_around(area: "Polygon", where: str) -> np.ndarray:
     return walls
 
 
-def _rounded(
-    name: str, corners: np.ndarray, angles: list[float], radii: list[float], closed: bool
+def _centre_line(
+    where: str, segments: Sequence[Segment], closed: bool
 ) -> tuple[np.ndarray, tuple[Turn, ...]]:
-    """The corner points with inserted arcs, and the turns with their distances.
-
-    Corner 0 is the last turn of a closed line. The line starts and ends at the end of its arc.
-    """
-    steps = np.diff(corners, axis=0)
-    lengths, headings = np.hypot(*steps.T), np.arctan2(steps[:, 1], steps[:, 0])
-    trims = [r * math.tan(abs(a) / 2) for a, r in zip(angles, radii, strict=True)]
-    after = [*trims[1:], trims[0] if closed else 0.0]
-    if np.any(lengths < np.array(trims) + np.array(after) - 1e-9):
-        raise InputError(f"{name}: a radius_m is too large for the straights beside it")
-    arcs = [
-        _arc(corners[i], float(headings[i]) - angles[i], angles[i], radii[i])
-        for i in range(len(angles))
-    ]
-    last = arcs[0] if closed else corners[-1:]
-    points = np.concatenate([arcs[0][-1:], *arcs[1:], last])
-    turns, walked = [], 0.0
-    order = [*range(1, len(angles)), 0] if closed else range(1, len(angles))
-    for i in order:
-        walked += float(lengths[i - 1]) - trims[i - 1] - trims[i]
-        bend = abs(angles[i]) * radii[i]
-        if angles[i]:
-            turns.append(Turn(walked + bend / 2, angles[i], radii[i]))
+    """The points of the centre line, the first again at the end if closed, and its turns."""
+    if not segments or segments[0].kind == "turn":
+        raise InputError(
+            f"{where}: segments[0] must be a straight: write {{length_m = 1.0}} before the turn"
+        )
+    count = len(segments)
+    trims = [0.0] * count  # from a turn's corner point to its arc, m; nan: it has no such point
+    for i, (kind, angle, radius) in enumerate(segments):
+        if kind != "turn":
+            continue
+        beside = [segments[i - 1], segments[(i + 1) % count] if closed or i + 1 < count else None]
+        if radius == 0 and any(s is not None and s.kind == "turn" for s in beside):
+            raise InputError(
+                f"{where}: segments[{i}]: a turn beside another needs a radius_m over 0"
+            )
+        round_ = abs(angle) >= math.pi - 1e-9
+        trims[i] = math.nan if round_ else radius * math.tan(abs(angle) / 2)
+    own = [_own_length(where, segments, trims, i, closed) for i in range(count)]
+    first = trims[-1] if closed and segments[-1].kind == "turn" else 0.0
+    at, heading, walked = np.array([0.0 if math.isnan(first) else first, 0.0]), 0.0, 0.0
+    points, turns = [at], []
+    for i, (kind, value, radius) in enumerate(segments):
+        if kind != "turn":
+            at = at + own[i] * np.array([math.cos(heading), math.sin(heading)])
+            points += [at] if own[i] > 1e-9 else []
+            walked += own[i]
+            continue
+        points += list(arc := _arc(at, heading, value, radius))
+        at, heading, bend = (arc[-1] if len(arc) else at), heading + value, abs(value) * radius
+        if value:
+            turns.append(Turn(walked + bend / 2, value, radius))
         walked += bend
-    return points, tuple(turns)
+    if closed:
+        off, turned = at - points[0], math.degrees(math.remainder(heading, 2 * math.pi))
+        if np.hypot(*off) > 1e-6 or abs(turned) > 1e-4:
+            raise InputError(
+                f"{where}: closed = true, but the segments end {off[0]:.3g} m ahead and "
+                f"{off[1]:.3g} m left of the start, turned by {turned:.3g}°"
+            )
+        points[-1] = points[0]
+    return np.array(points), tuple(turns)
 
 
-def _arc(corner: np.ndarray, heading: float, angle: float, radius: float) -> np.ndarray:
-    """Points on the arc of a corner that is entered at a heading; without an arc, the corner."""
+def _own_length(
+    where: str, segments: Sequence[Segment], trims: Sequence[float], i: int, closed: bool
+) -> float:
+    """The length (m) of the straight `i` between the arcs beside it; 0 for a turn."""
+    kind, value, _ = segments[i]
+    if kind == "turn":
+        return 0.0
+    if kind == "length":
+        return value
+    before = trims[i - 1] if i or closed else 0.0
+    after = trims[(i + 1) % len(segments)] if i + 1 < len(segments) or closed else 0.0
+    if math.isnan(before + after):
+        raise InputError(
+            f"{where}: segments[{i}]: straight_m runs to a corner point, and a turn of 180° or "
+            "more has none: write length_m, the straight's own length"
+        )
+    if value < before + after - 1e-9:
+        raise InputError(
+            f"{where}: a radius_m is too large for the straights beside it: segments[{i}] needs a "
+            f"straight_m of {before + after:.4g} or more"
+        )
+    return max(value - before - after, 0.0)
+
+
+def _arc(entry: np.ndarray, heading: float, angle: float, radius: float) -> np.ndarray:
+    """Points (n, 2) on an arc after its entry, in chords of at most `ARC_STEP`."""
     if radius == 0 or angle == 0:
-        return corner[None]
+        return np.zeros((0, 2))
     count = max(1, math.ceil(abs(angle) / ARC_STEP))
     bearings = heading + angle * (np.arange(count) + 0.5) / count
     chord = 2 * radius * math.sin(abs(angle) / count / 2)
     steps = chord * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    ahead = np.array([math.cos(heading), math.sin(heading)])
-    entry = corner - radius * math.tan(abs(angle) / 2) * ahead
-    return np.vstack([entry, entry + np.cumsum(steps, axis=0)])
+    return entry + np.cumsum(steps, axis=0)
+
+
+def _require_simple(where: str, points: np.ndarray, closed: bool) -> None:
+    """Raises `InputError` where a centre line crosses itself."""
+    from shapely import LinearRing, LineString
+
+    line = LinearRing(points) if closed and len(points) > 3 else LineString(points)
+    if not line.is_simple:
+        raise InputError(
+            f"{where}: the centre line crosses itself: write crosses = true if it should"
+        )
+
+
+def _opened(where: str, points: np.ndarray, closed: bool, width: float) -> np.ndarray:
+    """Walls (m, 4) of a corridor that crosses itself: the outline of all of it."""
+    from shapely import Polygon, unary_union
+
+    sides = [_offset(points, closed, side * width / 2) for side in (1, -1)]
+    pieces = [
+        Polygon([(*left[:2],), (*left[2:],), (*right[2:],), (*right[:2],)])
+        for left, right in zip(*sides, strict=True)
+    ]
+    area = unary_union([piece.buffer(1e-6) for piece in pieces]).simplify(1e-4)
+    if not isinstance(area, Polygon):
+        raise InputError(f"{where}: the corridor is not in one piece")
+    walls = walls_around(area, where)
+    if not closed:  # it is open at its ends
+        middle = (walls[:, :2] + walls[:, 2:]) / 2
+        ends = np.array([points[0], points[-1]])
+        away = np.min(np.hypot(*(middle[:, None] - ends).T), axis=0)
+        walls = walls[away > 1e-3]
+    return walls
 
 
 def _offset(points: np.ndarray, closed: bool, aside: float) -> np.ndarray:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from countersteer.car.parameter import unknown_key
-from countersteer.course.course import Course, Turn, from_segments, from_walls
+from countersteer.course.course import Course, Segment, Turn, from_segments, from_walls
 from countersteer.errors import InputError
 from countersteer.text import read_toml
 
 LIBRARY = importlib.resources.files("countersteer.course") / "library"
 
-KEYS = ("name", "width_m", "closed", "segments", "walls_m", "start", "goal")
+KEYS = ("name", "width_m", "closed", "crosses", "segments", "walls_m", "start", "goal")
+MOST_DEG, MOST_MITRED_DEG = 350, 179  # of a turn with a radius, and without
 PLACES = {
     "start": ("distance_m", "offset_m", "heading_deg"),
     "goal": ("distance_m",),
@@ -71,18 +72,31 @@ def course_from_tables(tables: dict[str, Any], where: str) -> Course:
     if not isinstance(segments, list) or not all(isinstance(s, dict) for s in segments):
         raise InputError(f"{where}: segments must be a list of {{straight_m}} and {{turn_deg}}")
     read = [_segment(s, f"{where}: segments[{i}]") for i, s in enumerate(segments)]
-    course = from_segments(where, width, closed, read, (start[0], start[1], start[2]), goal)
+    crosses = tables.get("crosses", False)
+    if not isinstance(crosses, bool):
+        raise InputError(f"{where}: crosses must be true or false")
+    begin = (start[0], start[1], start[2])
+    course = from_segments(where, width, closed, read, begin, goal, crosses)
     return dataclasses.replace(course, name=title)  # errors before this line name the file
 
 
-def _segment(segment: dict[str, Any], where: str) -> tuple[str, float, float]:
-    if set(segment) == {"straight_m"}:
-        return "straight", _number(segment["straight_m"], f"{where}.straight_m", 0.01, 1e4), 0.0
+def _segment(segment: dict[str, Any], where: str) -> Segment:
+    for key, kind in (("straight_m", "straight"), ("length_m", "length")):
+        if set(segment) == {key}:
+            return Segment(kind, _number(segment[key], f"{where}.{key}", 0.01, 1e4))
     if set(segment) in ({"turn_deg"}, {"turn_deg", "radius_m"}):
-        angle = _number(segment["turn_deg"], f"{where}.turn_deg", -179, 179)
         radius = _number(segment.get("radius_m", 0.0), f"{where}.radius_m", 0, 1e4)
-        return "turn", math.radians(angle), radius
-    raise InputError(f"{where} must be {{straight_m = …}} or {{turn_deg = …, radius_m = …}}")
+        angle = _number(segment["turn_deg"], f"{where}.turn_deg", -MOST_DEG, MOST_DEG)
+        if radius == 0 and abs(angle) > MOST_MITRED_DEG:
+            raise InputError(
+                f"{where}: a turn of {angle:g}° needs an arc: write radius_m beside it, or at most "
+                f"{MOST_MITRED_DEG}°"
+            )
+        return Segment("turn", math.radians(angle), radius)
+    raise InputError(
+        f"{where} must be {{straight_m = …}} (corner to corner), {{length_m = …}} (its own length) "
+        "or {turn_deg = …, radius_m = …}"
+    )
 
 
 def _place(tables: dict[str, Any], key: str, where: str, known: tuple[str, ...]) -> list[float]:

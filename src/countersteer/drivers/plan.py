@@ -22,10 +22,10 @@ from countersteer.course.position import Line, Place, line_of
 from countersteer.drivers import drift_turn
 from countersteer.drivers.drift_turn import DriftTurn
 from countersteer.drivers.driver import Observation, Status, paced
+from countersteer.drivers.pursuit import pursued
 from countersteer.drivers.straighten import Straighten
 from countersteer.errors import InputError
 from countersteer.estimation import spikes
-from countersteer.estimation.estimate import Estimate
 from countersteer.signals import Array, Command, Scalar
 from countersteer.text import read_toml
 
@@ -34,7 +34,6 @@ KINDS = STRAIGHTEN, COMMANDS, DRIFT, CURVE = range(4)
 NAMES = ("straighten", "commands", "drift", "curve")
 ASTRAY = 0.5  # m outside its place, beyond which a policy has missed its hand-over
 ALIGNED = 0.3  # rad to the corridor, within which the front sonar sees the corridor's end
-AHEAD = (0.2, 0.15)  # how far a curve looks ahead: m, and s at the car's speed
 REVERSE = 0.05  # m/s by which the car may approach a wall faster than its forward speed
 
 
@@ -172,10 +171,11 @@ class PolicySequence:
         on = self.straight.command(straight, seen, own.speed)
         table = jnp.sum(own.times <= seen.time - memory.since + 1e-6) - 1
         steering, throttle = on.steering, on.throttle
+        curve = pursued(self.line, here.distance, estimate, self.wheelbase, self.rear_axle)
         for which, lock, power in (
             (COMMANDS, own.steering[table], own.throttle[table]),
             (DRIFT, turning.steering, turning.throttle),
-            (CURVE, self._pursued(estimate, here), on.throttle),
+            (CURVE, curve, on.throttle),
         ):
             steering = jnp.where(own.does == which, lock, steering)
             throttle = jnp.where(own.does == which, power, throttle)
@@ -247,20 +247,6 @@ class PolicySequence:
         tick = jnp.where(heard.came(dt), memory.tick + 1, memory.tick)
         nearer = dt * (jnp.abs(seen.estimate.vx) + REVERSE)
         return spikes.update(memory, spikes.Reading(heard.value, tick), nearer, self.noise)
-
-    def _pursued(self, estimate: Estimate, here: Place) -> Scalar:
-        """Lock (rad) towards a point of the centre line ahead: pure pursuit (Coulter 1992).
-
-        lock = atan(2 wheelbase sin(a) / l). l and a are the distance and the bearing of the point
-        from the rear axle.
-        """
-        ahead = AHEAD[0] + AHEAD[1] * jnp.maximum(estimate.vx, 0.0)
-        x, y = self.line.at(here.distance + ahead)
-        cosine, sine = jnp.cos(estimate.heading), jnp.sin(estimate.heading)
-        dx = x - estimate.x + self.rear_axle * cosine
-        dy = y - estimate.y + self.rear_axle * sine
-        left = cosine * dy - sine * dx
-        return jnp.arctan(2 * self.wheelbase * left / (dx**2 + dy**2 + 1e-4))
 
 
 class Key(NamedTuple):

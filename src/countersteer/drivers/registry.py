@@ -12,6 +12,7 @@ from countersteer.drivers import DRIVERS, plan, policy
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
+from countersteer.drivers.pursuit import pursuit
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
@@ -37,7 +38,7 @@ def make_driver(
             raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
         return replay(read(Path(name))), {"kind": "replay"}
     tables: dict[str, Any] = {} if speed is None else {"speed_mps": speed}
-    if name == "straighten":
+    if name in ("straighten", "pursuit"):
         tables = {"kind": name, **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
@@ -58,6 +59,8 @@ def driver_of_tables(
         return plan.plan(numbers, where, course, car, read, speed, laps)
     if kind == "straighten":
         return straighten(course, car, speed)
+    if kind == "pursuit":
+        return pursuit(course, car, speed)
     if numbers:
         return drift_turn(course, car, speed, laps, *policy.policy_of_tables(numbers, where))
     raise InputError(f"{where}: no driver of kind {kind!r} can be made from plain data")
