@@ -22,6 +22,7 @@ from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.course.files import course_of_run
 from countersteer.drivers.driver import Driver, Heard, Observation, Status, status_of
+from countersteer.drivers.own import told_in_a_line
 from countersteer.drivers.plan import Read
 from countersteer.drivers.registry import driver_of_tables
 from countersteer.errors import InputError
@@ -148,7 +149,13 @@ class Pilot:
                 return _compiled_act(self, memory, readings, jnp.asarray(tick))
             silent, bare = dataclasses.replace(self, driver=None), memory._replace(driver=())
             estimate, observation = _compiled_observe(silent, bare, readings, jnp.asarray(tick))
-            answer = self.driver.act(memory.driver, jax.tree.map(np.asarray, observation))
+            try:
+                answer = self.driver.act(memory.driver, jax.tree.map(np.asarray, observation))
+            except InputError:
+                raise
+            except Exception as error:
+                where = f"{type(self.driver).__name__}.act at {self.dt * int(tick):.3f} s"
+                raise InputError(f"{where}: {told_in_a_line(error)}") from error
             command, own = checked(self.driver, answer)
             asked = (np.clip(command.throttle, -1, 1), np.clip(command.steering, *LOCKS))
             command = Command(*map(self.dtype.type, asked))

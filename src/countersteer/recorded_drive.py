@@ -78,7 +78,7 @@ def prepare(
         floor=floor,
         faults=faults,
     )
-    name = Path(driver).stem if driver.endswith((".csv", ".toml")) else driver
+    name = Path(driver).stem if driver.endswith((".csv", ".toml")) else driver.rpartition(":")[2]
     about = about_run(simulator, pilot, course, name, car_name, laps, nominal, tables)
     # The time limit is enough for a crawl of 0.3 m/s.
     return Drive(simulator, pilot, course, about, 20.0 + (course.lap_end(laps) or 0.0) / 0.3)

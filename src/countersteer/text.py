@@ -1,7 +1,8 @@
 """Text files of the user, and the TOML files of the project."""
 
+import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,17 @@ def read_toml(name: str, shelf: Any, kind: str, files: str = ".toml") -> tuple[d
         return tables_of(read_text(entry), name), name
     if path.suffix == ".toml":
         return tables_of(read_text(path, LARGEST_TOML), str(path)), str(path)
-    known = ", ".join(sorted(p.name.removesuffix(".toml") for p in shelf.iterdir()))
-    raise InputError(f"no {kind} {name}: give one of {known}, or the path of a {files} file")
+    known = sorted(p.name.removesuffix(".toml") for p in shelf.iterdir())
+    raise InputError(
+        f"no {kind} {name}{nearest(name, known)}: give one of {', '.join(known)}, or the path of a "
+        f"{files} file"
+    )
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """` (did you mean …?)`, where one of the known words is like it."""
+    found = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f" (did you mean {found[0]}?)" if found else ""
 
 
 def tables_of(text: str, where: str) -> dict[str, Any]:

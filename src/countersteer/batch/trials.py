@@ -5,6 +5,7 @@ goal is reached and its last turn has ended, or when it can no longer succeed. A
 all its trials have ended.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -210,6 +211,51 @@ def run_trials(
             return found
 
     whole: tuple[Score, Any] = engine.in_turn(run, varied, width, report)
+    return whole
+
+
+def run_one_by_one(
+    course: Course,
+    pilot: Pilot,
+    drawn: Drawn,
+    drivers: Sequence[Driver],
+    seeds: Sequence[int],
+    laps: int,
+    longest: float,
+    report: Callable[[int, int], None] = lambda *_: None,
+    link: Link = ONBOARD,
+) -> Score:
+    """The scores of `run_trials`, for drivers that JAX cannot trace: one drive after another."""
+    scores, dtype = [], np.asarray(drawn.charge).dtype
+    task = Task.of(course, laps, walls_end=True)
+    for i, (driver, seed) in enumerate(zip(drivers, seeds, strict=True)):
+        alone, floor = jax.tree.map(
+            lambda leaf, i=i: dtype.type(leaf[i]), (drawn.cars, drawn.floor)
+        )
+        simulator = Simulator.of(
+            course, alone, link=link, dt=pilot.dt, seed=int(seed), charge=drawn.charge[i],
+            start=tuple(drawn.pose[i]), floor=floor,
+        )  # fmt: skip
+        score = task.init()
+        every = max(1, round(PERIOD / pilot.dt))
+        with contextlib.closing(
+            simulator.run(dataclasses.replace(pilot, driver=driver), longest)
+        ) as pieces:
+            for record in pieces:
+                rows = np.nonzero(record.tick % every == 0)[0]
+                motion, turn = jax.tree.map(
+                    lambda leaf, rows=rows: leaf[rows], (record.motion, record.status.turn)
+                )
+                events = (record.wall_contacts[rows], record.rolled_over[rows])
+                sample = Sample(record.tick[rows] * pilot.dt, motion, *events, turn)
+                score, _ = task.follow(score, sample)
+                if score.outcome != Outcome.DRIVING.code:
+                    break
+        if score.outcome == Outcome.DRIVING.code:
+            score = score._replace(outcome=np.int32(Outcome.LATE.code))
+        scores.append(score)
+        report(i + 1, len(seeds))
+    whole: Score = jax.tree.map(lambda *leaves: np.stack(leaves), *scores)
     return whole
 
 

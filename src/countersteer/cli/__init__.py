@@ -16,6 +16,7 @@ from countersteer.cli import (
     importing,
     learn,
     listing,
+    new,
     replay,
     trials,
     tune,
@@ -35,7 +36,7 @@ __all__ = ["DONE", "FAILED", "INTERRUPTED", "WRONG_INPUT", "Progress", "entry", 
 
 VERBS = (
     drive, evaluate, replay, importing, trials, experiment, learn, tune, export, bench, listing,
-    completing,
+    new, completing,
 )  # fmt: skip
 
 

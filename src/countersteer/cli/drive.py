@@ -27,7 +27,8 @@ def add(verbs: Verbs) -> None:
         "with its image (ROS)"
     )
     drive.add_argument("course", metavar="COURSE", help=meaning)
-    meaning = f"{', '.join(DRIVERS)}, a plan's name, a policy or plan .toml, or a commands.csv"
+    names = ", ".join(DRIVERS)
+    meaning = f"{names}, a plan, a policy or plan .toml, a commands.csv, or FILE.py:CLASS"
     drive.option("--driver", None, str, "drift-turn", meaning)
     physics(drive, "rx7")
     meaning = (

@@ -8,7 +8,7 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers import DRIVERS, plan, policy
+from countersteer.drivers import DRIVERS, own, plan, policy
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
@@ -16,7 +16,7 @@ from countersteer.drivers.pursuit import pursuit
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
-from countersteer.text import read_toml
+from countersteer.text import nearest, read_toml
 
 
 def make_driver(
@@ -29,7 +29,8 @@ def make_driver(
 ) -> tuple[Driver, dict[str, Any]]:
     """A driver for a course and a nominal car, and its tables for `driver_of_tables`.
 
-    `name` is one of the library, a policy or plan `.toml`, or a `commands.csv`, which `read` reads.
+    `name` is one of the library, a policy or plan `.toml`, a `commands.csv`, which `read` reads, or
+    `FILE.py:CLASS`.
     `speed` (m/s) is the speed that it should bring to a turn. The tables of a `commands.csv` are a
     record only: they make no driver. Raises `InputError`.
     """
@@ -38,14 +39,19 @@ def make_driver(
             raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
         return replay(read(Path(name))), {"kind": "replay"}
     tables: dict[str, Any] = {} if speed is None else {"speed_mps": speed}
+    if own.is_code(name) or name in own.installed():
+        return own.own_driver(name, course, car, speed, laps), {"kind": "python", "name": name}
     if name in ("straighten", "pursuit"):
         tables = {"kind": name, **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
         tables = {"kind": str(numbers.get("kind")), "file": where, **tables, "numbers": numbers}
     else:
-        known = ", ".join([*DRIVERS, *plan.library()])
-        raise InputError(f"no driver {name}: give one of {known}, a .toml or a commands.csv")
+        known = [*DRIVERS, *plan.library(), *own.installed()]
+        raise InputError(
+            f"no driver {name}{nearest(name, known)}: give one of {', '.join(known)}, a policy or "
+            "plan .toml, a commands.csv, or FILE.py:CLASS"
+        )
     return driver_of_tables(tables, course, car, laps, read), tables
 
 

@@ -1,0 +1,1 @@
+"""What `countersteer new` writes: files that run as they are."""
