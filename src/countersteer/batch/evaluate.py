@@ -1,7 +1,7 @@
 """Evaluation of drivers over random cars: success with its interval, errors and times."""
 
 import dataclasses
-import math
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -9,7 +9,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from countersteer.batch.engine import LANES
-from countersteer.batch.population import Population, draw
+from countersteer.batch.population import Drawn, Population, draw
+from countersteer.batch.separation import separation_line
 from countersteer.batch.trials import Watch, run_one_by_one, run_trials
 from countersteer.car.car import Car
 from countersteer.course.course import Course
@@ -18,9 +19,8 @@ from countersteer.errors import InputError
 from countersteer.link.link import Link
 from countersteer.pilot import Pilot, traceable
 from countersteer.sensing.faults import SensorFault
-from countersteer.task.judge import Outcome, Score
+from countersteer.task.judge import DRIFT, Outcome, Score
 
-DRIFT = math.radians(25)  # sideslip that makes a turn a drift
 CONFIDENCE = 0.95
 
 
@@ -48,6 +48,11 @@ class Trials:
         if self.course.goal_distance is None:
             raise InputError(f"{self.course.name}: has no goal, so nothing tells a success")
 
+    @functools.cached_property
+    def drawn(self) -> Drawn:
+        """What is drawn for each trial, in 32 bits."""
+        return draw(self.population, self.car, self.course, self.seeds, np.float32, self.speeds)
+
     def run(
         self,
         make: Callable[[float | None], Driver],
@@ -65,7 +70,7 @@ class Trials:
         lanes: int = LANES,
     ) -> tuple[Score, Any]:
         """The scores, as `run`, and the result of `watch`. `faults` holds times for each trial."""
-        drawn = draw(self.population, self.car, self.course, self.seeds, np.float32, self.speeds)
+        drawn = self.drawn
         if drawn.speed is None:
             drivers = [make(None)] * len(self.seeds)
         else:
@@ -182,6 +187,7 @@ def table_lines(found: Mapping[str, dict[str, Any]]) -> list[str]:
             f"{text('heading_error_rms_deg', '.2f'):>8}°"
             f"{text('peak_sideslip_deg_median', '.1f'):>9}°{text('lap_time_s_median', '.2f'):>7}s"
         )
+        lines += [f"  {separation_line(draw)}" for draw in one.get("separated_by", ())]
         for reason, seeds in one["failures"].items():
             shown = " ".join(map(str, seeds[:12])) + (" …" if len(seeds) > 12 else "")
             lines.append(f"  {len(seeds)} {reason}: seeds {shown}")

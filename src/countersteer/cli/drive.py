@@ -1,6 +1,7 @@
 """`drive`: one closed-loop drive over a course."""
 
 import argparse
+import sys
 from typing import TYPE_CHECKING, Any
 
 from countersteer.cli.options import (
@@ -51,6 +52,7 @@ def run(options: argparse.Namespace) -> int:
     """`drive`."""
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
+    from countersteer.drivers.policy import for_another_car
     from countersteer.link.link import LINKS
     from countersteer.recorded_drive import prepare
     from countersteer.sensing.faults import read_fault
@@ -83,6 +85,9 @@ def run(options: argparse.Namespace) -> int:
         floor=floor,
         faults=tuple(read_fault(text) for text in options.fault),
     )
+    note = for_another_car(drive.about["pilot"], options.car)
+    if note:
+        print(f"countersteer: {note}", file=sys.stderr)
     return record(options, drive, course.name)
 
 

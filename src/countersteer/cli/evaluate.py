@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +35,20 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`evaluate`."""
+    import numpy as np
+
     from countersteer.batch import evaluate
     from countersteer.batch.population import load_population
+    from countersteer.batch.separation import drawn_columns, result_columns, rows, separation
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
+    from countersteer.drivers.policy import for_another_car
     from countersteer.drivers.registry import make_driver
     from countersteer.link.link import LINKS
     from countersteer.runs.files import read_commands
     from countersteer.runs.recorder import new_folder
+    from countersteer.task.judge import Outcome
     from countersteer.viewing.evaluation import draw_evaluation
 
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
@@ -54,18 +60,35 @@ def run(options: argparse.Namespace) -> int:
         LINKS[options.link], options.estimate, options.dt,
     )  # fmt: skip
     folder = new_folder(options.out, f"{Path(options.course).stem}-evaluate")
-    scores = {}
+    scores: dict[str, Any] = {}
+    notes: dict[str, str | None] = {}
     with Progress(options.json) as progress:
         for i, name in enumerate(options.driver):
 
             def made(speed: float | None, name: str = name) -> Any:
-                return make_driver(name, course, nominal, speed, options.laps, read_commands)[0]
+                made, tables = make_driver(
+                    name, course, nominal, speed, options.laps, read_commands
+                )
+                notes[name] = for_another_car(tables, options.car)
+                return made
 
             def report(done: int, trials: int, before: int = i * options.trials) -> None:
                 progress.show(before + done, len(options.driver) * trials)
 
             scores[name] = trials.run(made, report)
-    found = {name: evaluate.results(score, seeds) for name, score in scores.items()}
+    columns = drawn_columns(population, trials.drawn, course)
+    for note in filter(None, notes.values()):
+        print(f"countersteer: {note}", file=sys.stderr)
+    found = {}
+    table: dict[str, Any] = {"driver": [], "seed": []}
+    for name, score in scores.items():
+        won = np.asarray(score.outcome == Outcome.REACHED.code)
+        found[name] = evaluate.results(score, seeds) | {"separated_by": separation(columns, won)}
+        results = result_columns(score)
+        for key, values in {"seed": seeds, **columns, **results}.items():
+            table.setdefault(key, []).extend(values)
+        table["driver"] += [name] * len(seeds)
+    (folder / "trials.csv").write_text(rows(table))
     result = trials.about() | {"car": options.car, "drivers": found}
     (folder / "evaluate.json").write_text(json.dumps(result, indent=1) + "\n")
     picture = folder / "evaluate.png"
@@ -76,10 +99,18 @@ def run(options: argparse.Namespace) -> int:
         return DONE
     for line in evaluate.table_lines(found):
         print(line)
-    print(f"picture: {picture}")
-    words = ["drive", options.course, "--cars", options.cars, "--car", options.car]
+    print(f"picture: {picture}; every trial: {folder / 'trials.csv'}")
+    print(f"one trial again: {_again(options)}")
+    return DONE
+
+
+def _again(options: argparse.Namespace) -> str:
+    """The command that drives the first failed trial, or the first, again."""
+    driver = options.driver[0]
+    words = ["countersteer", "drive", options.course, "--driver", driver, "--seed", options.seed]
+    words += ["--cars", options.cars, "--car", options.car, "--laps", options.laps]
+    words += ["--link", options.link, "--estimate", options.estimate, "--dt", f"{options.dt:g}"]
+    words += [word for change in options.set for word in ("--set", change)]
     if options.speed_mps is not None:
         words += ["--speed-mps", "{:g}:{:g}".format(*options.speed_mps)]
-    print(f"one trial again: countersteer {shlex.join(words)} --driver D --seed SEED, and what")
-    print("else was asked for here: --set, --laps, --link, --estimate, --dt")
-    return DONE
+    return shlex.join(map(str, words))

@@ -94,7 +94,12 @@ def run_turn(options: argparse.Namespace) -> int:
     )
     words = f"countersteer learn turn {' '.join(options.courses)} --car {options.car}"
     source = f"{words} --cars {options.cars} --generations {options.generations}"
-    save_policy(options.out, {"turning": source, "stop_angle": source}, *policy)
+    save_policy(
+        options.out,
+        {"turning": source, "stop_angle": source},
+        *policy,
+        car=Path(options.car).stem,
+    )
     result = {"policy": str(options.out), "generations": history}
     print(json.dumps(result) if options.json else f"policy: {options.out}")
     return DONE

@@ -60,7 +60,7 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     """The summary for a person."""
     lap = f" in {result['lap_time_s']:.2f} s" if result["lap_time_s"] else ""
     touched = result["wall_contacts"]
-    print(f"{result['outcome']}{lap}, {touched} wall contact{'s' if touched != 1 else ''}")
+    print(f"{result['verdict']}{lap}, {touched} wall contact{'s' if touched != 1 else ''}")
     for i, turn in enumerate(result["turns"], start=1):
         print(
             f"  turn {i}: in at {turn['entry_speed_mps']:.2f} m/s, "

@@ -109,7 +109,7 @@ def load_policy(name: str) -> Policy:
 
 def policy_of_tables(tables: Mapping[str, Any], where: str) -> Policy:
     """A policy from the tables of the file `where`. Raises `InputError`."""
-    known = {"kind": 0, "description": 0, "source": 0, **TABLES}
+    known = {"kind": 0, "description": 0, "car": 0, "source": 0, **TABLES}
     for key in tables:
         if key not in known:
             raise unknown_key(where, key, known)
@@ -182,12 +182,26 @@ def _written(declared: Declaration, value: Any) -> Any:
     return float(f"{write_value(declared, value):.9g}")
 
 
+def for_another_car(pilot: Mapping[str, Any], car: str) -> str | None:
+    """A line that says so, where the policy of a `[pilot]` table was learned for another car."""
+    learned = pilot.get("numbers", {}).get("car")
+    own = Path(car).stem
+    if learned in (None, own):
+        return None
+    return (
+        f"{Path(str(pilot.get('file', KIND))).stem} was learned for {learned}, not for {own}: "
+        f"'countersteer learn turn COURSE --car {car} --out POLICY.toml' learns one for it"
+    )
+
+
 def save_policy(
     path: Path,
     source: Mapping[str, str],
     turning: Turning | None = None,
     stop_angle: StopAngle | None = None,
+    car: str | None = None,
 ) -> None:
-    """Write a policy. `source` says where its numbers are from."""
-    tables = {"kind": KIND, **policy_tables(turning, stop_angle), "source": dict(source)}
+    """Write a policy for a car. `source` says where its numbers are from."""
+    whose = {} if car is None else {"car": car}
+    tables = {"kind": KIND, **whose, **policy_tables(turning, stop_angle), "source": dict(source)}
     path.write_text(toml_of(tables))

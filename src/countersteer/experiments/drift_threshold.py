@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from countersteer.batch.engine import LANES
-from countersteer.batch.evaluate import DRIFT
 from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.errors import InputError
 from countersteer.experiments.open_turns import OFF, series_of
 from countersteer.experiments.result import Report, Result, silent
 from countersteer.runs.run import Run, drawn_car
+from countersteer.task.judge import DRIFT
 from countersteer.task.turns import sideslip
 
 SPEEDS = np.linspace(0.4, 4.0, 37)  # m/s

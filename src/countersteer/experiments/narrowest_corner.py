@@ -18,7 +18,6 @@ import numpy as np
 from scipy.stats import qmc
 
 from countersteer.batch.engine import LANES
-from countersteer.batch.evaluate import DRIFT
 from countersteer.batch.open_drives import drives, repeated
 from countersteer.car.car import Car
 from countersteer.course.course import from_segments
@@ -27,6 +26,7 @@ from countersteer.drivers.policy import library
 from countersteer.drivers.straighten import holding_throttle
 from countersteer.drivers.turning import Turning
 from countersteer.experiments.result import Report, Result, silent
+from countersteer.task.judge import DRIFT
 
 DRAWS = 512
 GATE = 1.2  # m before and behind the corner

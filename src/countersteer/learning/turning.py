@@ -97,12 +97,14 @@ def search(
     deviation = spread * np.concatenate(
         [np.full(np.size(value), SPREAD[name]) for name, value in _numbers(begin)]
     )
+    limits = ranges(begin)
     best = max(candidates // 4, 1)
     weights = np.log(best + 0.5) - np.log(np.arange(1, best + 1))
     weights /= weights.sum()
     for number in range(generations):
         tried = mean + deviation * rng.standard_normal((candidates, len(mean)))
         tried[0] = mean
+        tried = np.clip(tried, *limits)
         seeds = range(1000 + seed + number * trials, 1000 + seed + (number + 1) * trials)
         policies = [shaped(begin, numbers) for numbers in tried]
         score = drive(courses[number % len(courses)], car, population, policies, seeds)
@@ -147,6 +149,18 @@ def _numbers(policy: Policy) -> list[tuple[str, Any]]:
         for name in entries
         if name in SPREAD
     ]
+
+
+def ranges(like: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """The declared range of each number of `flat`: lowest and highest."""
+    lows, highs = [], []
+    for part, (_, entries) in TABLES.items():
+        for name, entry in entries.items():
+            if name in SPREAD:
+                count = np.size(getattr(getattr(like, part), name))
+                lows.append(np.full(count, entry.declared.low))
+                highs.append(np.full(count, entry.declared.high))
+    return np.concatenate(lows), np.concatenate(highs)
 
 
 def flat(policy: Policy) -> np.ndarray:

@@ -5,6 +5,8 @@ batch. It uses motion and course alone, so all drivers and recordings are judged
 """
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -28,6 +30,7 @@ from countersteer.task.turns import (
     goes_straight,
 )
 
+DRIFT = math.radians(25)  # sideslip; beyond it, a turn is a drift
 PERIOD = 0.005  # s between two samples that are judged, as in truth.csv
 STALLED = 5.0  # s without progress, after which a drive has stalled
 STEP = 0.05  # m that count as progress
@@ -198,17 +201,30 @@ def _follow(task: Task, score: Score, samples: Sample) -> tuple[Score, Array]:
 
 
 def summary(score: Score, outcome: Outcome) -> dict[str, Any]:
-    """The JSON of a drive with this outcome."""
+    """The JSON of a drive with this outcome. A goal reached with a wall touched is `TOUCHED`."""
     completed = outcome in (Outcome.REACHED, Outcome.DONE)
     contacts = int(score.wall_contacts)
+    turns = turning.results(score.turns, score.handover, float(score.time))
+    if completed and contacts:
+        outcome = Outcome.TOUCHED
+    slips = [turn.peak_sideslip_deg for turn in turns]
     return {
         "completed": completed,
         "success": completed and contacts == 0,
         "outcome": outcome.value,
+        "verdict": outcome.value + (_of_drifts(slips) if completed else ""),
         "wall_contacts": contacts,
         "lap_time_s": float(score.goal_time) if np.isfinite(score.goal_time) else None,
-        "turns": [
-            dataclasses.asdict(turn)
-            for turn in turning.results(score.turns, score.handover, float(score.time))
-        ],
+        "drifts": sum(slip > math.degrees(DRIFT) for slip in slips),
+        "turns": [dataclasses.asdict(turn) for turn in turns],
     }
+
+
+def _of_drifts(slips: Sequence[float]) -> str:
+    """What a verdict adds where not every turn was a drift."""
+    drifts = sum(slip > math.degrees(DRIFT) for slip in slips)
+    if drifts == len(slips):
+        return ""
+    if drifts:
+        return f", but drifted in {drifts} of {len(slips)} turns"
+    return f", but did not drift: {max(slips):.0f}° of sideslip at most"

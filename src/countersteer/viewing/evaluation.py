@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from countersteer.batch.evaluate import DRIFT
-from countersteer.task.judge import Outcome, Score
+from countersteer.task.judge import DRIFT, Outcome, Score
 
 
 def draw_evaluation(scores: Mapping[str, Score], title: str, path: Path) -> None:

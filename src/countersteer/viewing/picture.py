@@ -99,10 +99,12 @@ def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
 def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: float) -> None:
     """Write the title, the outcome and the main figures across the top."""
     summary = view["summary"]
-    status = str(summary["outcome"])
+    status = str(summary.get("verdict", summary["outcome"]))
     figure.text(0.022, 0.955, str(view["title"]), color=INK, size=18, weight="bold", va="center")
     verdict = status[:1].upper() + status[1:]
-    mood = _GOOD if summary["completed"] else _BAD
+    mood = _GOOD if summary.get("success", summary["completed"]) else _BAD
+    if mood == _GOOD and summary.get("drifts", len(summary["turns"])) < len(summary["turns"]):
+        mood = INK
     figure.text(0.022, 0.914, verdict, color=mood, size=13, weight="bold", va="center")
     lap_time, times = summary.get("lap_time_s"), view["time_s"]
     facts = (
