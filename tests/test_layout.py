@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "countersteer"
 
-EVERYONE = {"errors", "text", "progress", "signals", "random_streams", "compiling", "kept_programs"}
+EVERYONE = {"errors", "text", "progress", "signals", "random_streams", "compiling", "kept_programs", "cache"}
 MAY_IMPORT = {
     "car": set(),
     "course": {"car"},

@@ -3,9 +3,10 @@
 import os
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax
+
+from countersteer.cache import cache_folder
 
 
 def configure_jax(batches: bool = True, blocks: bool = False, cores: int = 1) -> None:
@@ -26,12 +27,6 @@ def configure_jax(batches: bool = True, blocks: bool = False, cores: int = 1) ->
     jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-def cache_folder() -> Path:
-    """Where the user's compiled programs are kept."""
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(home) / "countersteer"
 
 
 def compiler_flags(

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import countersteer
-from countersteer.compiling import cache_folder
+from countersteer.cache import cache_folder
 
 FORMAT = 1
 PACKAGE = "countersteer"

@@ -1,14 +1,23 @@
-"""Progress on long work."""
+"""Progress on long work, and on the wait before it."""
 
+import contextlib
+import json
 import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
+
+STEP = 0.5  # s between two updates of the wait
+SHORTEST = 1.0  # s; a shorter wait is not remembered
 
 
 class Progress:
-    """A progress bar, on a terminal or in a notebook only."""
+    """A progress bar, shown on a terminal or in a notebook only."""
 
     def __init__(self, quiet: bool = False) -> None:
-        """If `quiet`, nothing is shown."""
+        """If `quiet`, nothing is shown anywhere."""
         self._quiet = quiet or not (sys.stderr.isatty() or "ipykernel" in sys.modules)
         self._bar: Any = None
 
@@ -20,7 +29,7 @@ class Progress:
             self._bar.close()
 
     def show(self, done: float, of: float) -> None:
-        """Move the bar to `done` of `of`."""
+        """Set the bar to `done` out of `of`."""
         if self._quiet:
             return
         if self._bar is None:
@@ -29,3 +38,85 @@ class Progress:
             self._bar = tqdm(total=of, leave=False, bar_format="{l_bar}{bar}| {elapsed}")
         self._bar.n = min(done, of)
         self._bar.refresh()
+
+
+@contextlib.contextmanager
+def waiting(what: str, memory: Path) -> Iterator[None]:
+    """On a terminal: says at once what is started, and how long it takes to get ready.
+
+    The line goes away with the first output of the work. How long that took is kept in the file
+    `memory`, by `what`, for the next time.
+    """
+    if not sys.stderr.isatty():
+        yield
+        return
+    wait = _Wait(what, memory)
+    streams = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (_First(stream, wait) for stream in streams)
+    try:
+        yield
+    finally:
+        wait.end(remember=False)
+        sys.stdout, sys.stderr = streams
+
+
+class _Wait:
+    """The line, in a thread of its own: imports and compilers do not stop it."""
+
+    def __init__(self, what: str, memory: Path) -> None:
+        self._what, self._memory, self._out = what, memory, sys.stderr
+        self._begin, self._over = time.monotonic(), threading.Event()
+        last = _read(memory).get(what)
+        self._last = f", {last:.0f} s last time" if isinstance(last, int | float) else ""
+        self._say("starting")
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _say(self, words: str) -> None:
+        self._out.write(f"\r\033[K{self._what}: {words}")
+        self._out.flush()
+
+    def _run(self) -> None:
+        while not self._over.wait(STEP):
+            spent = time.monotonic() - self._begin
+            self._say(f"loading and compiling, {spent:.0f} s{self._last}")
+
+    def end(self, remember: bool = True) -> None:
+        """Takes the line away."""
+        if self._over.is_set():
+            return
+        self._over.set()
+        self._thread.join()
+        self._out.write("\r\033[K")
+        self._out.flush()
+        spent = time.monotonic() - self._begin
+        if remember and spent > SHORTEST:
+            with contextlib.suppress(OSError):
+                self._memory.parent.mkdir(parents=True, exist_ok=True)
+                text = json.dumps(_read(self._memory) | {self._what: round(spent, 1)})
+                self._memory.write_text(text)
+
+
+class _First:
+    """A stream whose first output ends the wait."""
+
+    def __init__(self, stream: Any, wait: _Wait) -> None:
+        self._stream, self._wait = stream, wait
+
+    def write(self, text: str) -> int:
+        """Writes; the wait is over."""
+        self._wait.end()
+        written: int = self._stream.write(text)
+        return written
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """The times of before; none where they cannot be read."""
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

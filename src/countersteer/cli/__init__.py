@@ -1,11 +1,13 @@
 """The command line: one file a verb, its options beside its handler. Parse, call, print."""
 
+import argparse
 import os
 import signal
 import sys
 from collections.abc import Sequence
 
 from countersteer import __version__
+from countersteer.cache import cache_folder
 from countersteer.cli import (
     bench,
     completing,
@@ -31,6 +33,7 @@ from countersteer.cli.options import (
     Verbs,
 )
 from countersteer.errors import InputError
+from countersteer.progress import waiting
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "WRONG_INPUT", "Progress", "entry", "main"]
 
@@ -38,6 +41,10 @@ VERBS = (
     drive, evaluate, replay, importing, trials, experiment, learn, tune, export, bench, listing,
     new, completing,
 )  # fmt: skip
+
+
+# They import JAX and compile, which takes seconds.
+LONG = {"drive", "evaluate", "replay", "trials", "experiment", "learn", "tune", "export", "bench"}
 
 
 def parser() -> Parser:
@@ -52,19 +59,36 @@ def parser() -> Parser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a verb; returns the exit status."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    top = parser()
+    if not given:
+        top.print_help()
+        return DONE
     try:
-        options = parser().parse_args(arguments)
-        return int(options.run(options))
+        options = top.parse_args(given)
+        if options.verb not in LONG or options.json:
+            return int(options.run(options))
+        with waiting(_title(options), cache_folder() / "waits.json"):
+            return int(options.run(options))
     except InputError as error:
         print(f"countersteer: {' '.join(str(error).split())}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
         print("countersteer: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:  # who reads the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         print(f"countersteer: {name}{error.strerror or error}", file=sys.stderr)
         return FAILED
+
+
+def _title(options: argparse.Namespace) -> str:
+    """What is under way, in words."""
+    about = [getattr(options, name, None) for name in ("what", "name", "course", "source")]
+    return " ".join([options.verb, *(str(word) for word in about if word)])
 
 
 def entry() -> None:
@@ -79,4 +103,5 @@ def entry() -> None:
         os._exit(INTERRUPTED)
 
     signal.signal(signal.SIGINT, leave)
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's own log is for its developers
     sys.exit(main())

@@ -2,12 +2,14 @@
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from countersteer.errors import InputError
 from countersteer.progress import Progress
+from countersteer.text import nearest
 
 __all__ = ["Progress"]  # and all else that is defined here
 
@@ -18,9 +20,22 @@ Handler = Callable[[argparse.Namespace], int]
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line."""
 
+    known: ClassVar[list[str]] = []  # options of the verb that is parsed
+
     def error(self, message: str) -> Any:
-        """Raises `InputError` with what argparse found."""
+        """Raises `InputError` with what argparse found, and the nearest word that there is."""
+        if wrong := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
+            known = re.findall(r"[\w-]+", wrong[2])
+            message = message[: wrong.start()] + f"there is no {wrong[1]}{nearest(wrong[1], known)}"
+        elif message.startswith("unrecognized arguments: "):
+            word = message.split(": ", 1)[1].split()[0].partition("=")[0]
+            message = f"there is no {word}{nearest(word, self.known)}"
         raise InputError(f"{message} (see {self.prog} --help)")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse; the options of the verb that is parsed last are known for its errors."""
+        Parser.known = [*self._option_string_actions]
+        return super().parse_known_args(args, namespace)
 
     def option(
         self, name: str, metavar: str | None, kind: Any, default: Any, meaning: str, **more: Any
