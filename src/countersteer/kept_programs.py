@@ -17,17 +17,20 @@ import importlib
 import json
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src.lax import linalg
 
 import countersteer
 from countersteer.cache import cache_folder
 
+_INITIALIZE = getattr(linalg, "initialize_lapack", None)  # JAX has no public switch for it
 FORMAT = 1
 PACKAGE = "countersteer"
 
@@ -44,6 +47,7 @@ class Kept:
         self.function, self.static = function, frozenset(static)
         self._jitted = jax.jit(function, static_argnums=tuple(static))
         self._programs: dict[Any, _Program | None] = {}
+        self._last: tuple[Any, list[Any], _Program] | None = None
         self._lock = threading.Lock()
         functools.update_wrapper(self, function)
 
@@ -53,47 +57,43 @@ class Kept:
         leaves, tree = jax.tree.flatten(dynamic)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.function(*arguments)
-        program = self._program(arguments, leaves, tree)
+        leaves = [*map(_strong, leaves)]
+        static = tuple(arguments[i] for i in sorted(self.static))
+        about = (tree, static, jnp.result_type(float), _device())
+        types = [(leaf.shape, leaf.dtype) for leaf in leaves]
+        last = self._last
+        if last is not None and last[0] == about and last[1] == types:
+            program: _Program | None = last[2]
+        else:
+            program = self._program(about, tuple(types), arguments, leaves)
+            if program is not None:
+                self._last = (about, types, program)
         if program is None:
             return self._jitted(*arguments)
-        return jax.tree.unflatten(program.tree, program.run(*map(_strong, leaves)))
+        return jax.tree.unflatten(program.tree, program.run(*leaves))
 
-    def ready(self, *arguments: Any) -> None:
-        """Loads or makes the program for such arguments, and compiles it, but does not run it."""
-        dynamic = [a for i, a in enumerate(arguments) if i not in self.static]
-        leaves, tree = jax.tree.flatten(dynamic)
-        program = self._program(arguments, leaves, tree)
-        if program is None:
-            self._jitted.lower(*arguments).compile()
-        else:
-            program.compiled([*map(_strong, leaves)])
-
-    def _program(self, arguments: Sequence[Any], leaves: list[Any], tree: Any) -> "_Program | None":
-        types = tuple(_type(leaf) for leaf in leaves)
-        static = tuple(arguments[i] for i in sorted(self.static))
-        signature = (tree, types, static, jnp.result_type(float), _device())
+    def _program(
+        self, about: tuple[Any, ...], types: Any, arguments: Sequence[Any], leaves: list[Any]
+    ) -> "_Program | None":
+        """From this process, from the cache, or made and put there; None if it cannot be kept."""
+        tree, static, default, device = about
+        signature = (*about, types)
         with self._lock:
             if signature not in self._programs:
-                self._programs[signature] = self._find(arguments, leaves, tree, types, static)
+                made = None
+                if _own(tree):
+                    name = f"{self.function.__module__}.{self.function.__qualname__}"
+                    versions = (FORMAT, source(), jax.__version__, jax.lib.__version__)
+                    typed = tuple((shape, str(dtype)) for shape, dtype in types)
+                    text = repr((*versions, str(default), name, static, typed, str(tree)))
+                    if " at 0x" not in text:  # else something without a lasting name
+                        key = hashlib.sha256(text.encode()).hexdigest()[:32]
+                        made = _find(key, device) or self._make(arguments, leaves, tree, key)
+                self._programs[signature] = made
             return self._programs[signature]
 
-    def _find(
-        self, arguments: Sequence[Any], leaves: list[Any], tree: Any, types: Any, static: Any
-    ) -> "_Program | None":
-        """From the cache, or made and put there; None if it cannot be kept."""
-        if not _own(tree):
-            return None
-        name = f"{self.function.__module__}.{self.function.__qualname__}"
-        versions = (FORMAT, source(), jax.__version__, jax.lib.__version__)
-        text = repr((*versions, str(jnp.result_type(float)), name, static, types, str(tree)))
-        if " at 0x" in text:  # something without a lasting name
-            return None
-        key = hashlib.sha256(text.encode()).hexdigest()[:32]
-        folder = cache_folder() / "programs"
-        return _read(folder, key) or self._make(arguments, leaves, tree, folder, key)
-
     def _make(
-        self, arguments: Sequence[Any], leaves: list[Any], tree: Any, folder: Path, key: str
+        self, arguments: Sequence[Any], leaves: list[Any], tree: Any, key: str
     ) -> "_Program | None":
         """Traces and exports the function, and stores it if it can be."""
         from jax import export
@@ -113,9 +113,8 @@ class Kept:
             return None
         head = json.dumps({"format": FORMAT, "result": structure}).encode()
         with contextlib.suppress(OSError):  # a cache that cannot be written is no cache
-            folder.mkdir(parents=True, exist_ok=True)
-            _write(folder / key, len(head).to_bytes(8, "little") + head + exported.serialize())
-        return _Program(exported, result[0])
+            _write(key, len(head).to_bytes(8, "little") + head + exported.serialize())
+        return _Program(exported, result[0], _device())
 
 
 def kept(*static: int) -> Callable[[Callable[..., Any]], Kept]:
@@ -123,49 +122,108 @@ def kept(*static: int) -> Callable[[Callable[..., Any]], Kept]:
     return lambda function: Kept(function, static)
 
 
+# Programs that another thread loads, by key and device, and all that this process has used.
+_coming: dict[tuple[str, Any], Future[Any]] = {}
+_used: list[dict[str, Any]] = []
+
+
+def preload(what: str) -> None:
+    """Begins to load, beside all else, the programs that the last process remembered as `what`.
+
+    They are loaded in their order. A guess that is wrong costs nothing but the other core's time.
+    """
+    try:
+        last = json.loads((_folder() / f"{what}.json").read_text())["programs"]
+        wanted = [(str(w["key"]), jax.devices()[int(w["device"])], bool(w["wide"])) for w in last]
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        return
+    for key, device, _ in wanted:
+        _coming[key, device] = Future()
+
+    def load() -> None:
+        for key, device, wide in wanted:
+            try:
+                with jax.enable_x64(wide), jax.default_device(device):
+                    _coming[key, device].set_result(_read(key, device))
+            except BaseException:  # it is loaded or made again where it is needed
+                _coming[key, device].set_result(None)
+
+    threading.Thread(target=load, daemon=True).start()
+
+
+def remember(what: str) -> None:
+    """Keeps the names of the programs of this process for `preload`, the largest first."""
+
+    def size(one: dict[str, Any]) -> int:
+        return (_folder() / one["key"]).stat().st_size
+
+    with contextlib.suppress(OSError):
+        programs = sorted(_used, key=size, reverse=True)
+        _write(f"{what}.json", json.dumps({"format": FORMAT, "programs": programs}).encode())
+
+
 class _Program:
-    """An exported program, and the tree of its result."""
+    """A program compiled for a device, and the tree of its result."""
 
-    def __init__(self, exported: Any, tree: Any) -> None:
-        # Without a named device, JAX compiles again for the results of a call before.
-        here = jax.sharding.SingleDeviceSharding(_device())
+    def __init__(self, exported: Any, tree: Any, device: Any) -> None:
         self.tree = tree
-        self.run = jax.jit(exported.call, in_shardings=here, out_shardings=here)
+        # Without a named device, JAX compiles again for the results of a call before.
+        here = jax.sharding.SingleDeviceSharding(device)
+        types = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in exported.in_avals]
+        run = jax.jit(exported.call, in_shardings=here, out_shardings=here)
+        with _without_lapack(exported):
+            self.run = run.lower(*types).compile()
 
-    def compiled(self, leaves: Sequence[Any]) -> None:
-        """Compiles it for arguments of these types."""
-        self.run.lower(*leaves).compile()
+
+def _find(key: str, device: Any) -> _Program | None:
+    """A stored program, or one that is being loaded; None where there is none."""
+    wide = jnp.result_type(float) == np.float64
+    _used.append({"key": key, "device": jax.devices().index(device), "wide": bool(wide)})
+    coming = _coming.get((key, device))
+    found: _Program | None = coming.result() if coming is not None else None
+    return found or _read(key, device)
 
 
-def _read(folder: Path, key: str) -> _Program | None:
-    """The stored program; None where there is none that can be read."""
+def _read(key: str, device: Any) -> _Program | None:
+    """A stored program; None where there is none that can be read."""
     from jax import export
 
     try:
-        data = (folder / key).read_bytes()
+        data = (_folder() / key).read_bytes()
         size = int.from_bytes(data[:8], "little")
         head = json.loads(data[8 : 8 + size])
         tree = jax.tree.structure(_built(head["result"]))
-        return _Program(export.deserialize(bytearray(data[8 + size :])), tree)
+        return _Program(export.deserialize(bytearray(data[8 + size :])), tree, device)
     except FileNotFoundError:
         return None
     except Exception:  # cut off, or of another version: it is made again
         return None
 
 
-def _write(file: Path, data: bytes) -> None:
+def _folder() -> Path:
+    return cache_folder() / "programs"
+
+
+def _write(name: str, data: bytes) -> None:
     """All or nothing, as two processes may write at once."""
-    part = file.with_suffix(f".{os.getpid()}")
+    folder = _folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / f"{name}.{os.getpid()}"
     part.write_bytes(data)
-    part.replace(file)
+    part.replace(folder / name)
 
 
-def _type(leaf: Any) -> tuple[Any, ...]:
-    """Shape and type of an argument; a number of Python is an array of JAX's default type."""
-    dtype = getattr(leaf, "dtype", None) or jnp.result_type(leaf)
-    if jnp.issubdtype(dtype, jax.dtypes.extended):  # a key
-        return (np.shape(leaf), str(dtype))
-    return (np.shape(leaf), str(jax.dtypes.canonicalize_dtype(dtype)))
+@contextlib.contextmanager
+def _without_lapack(exported: Any) -> Iterator[None]:
+    """Spares JAX the import of SciPy's LAPACK (0.2 s), for a program that does not call it."""
+    if b"lapack" in exported.mlir_module_serialized or _INITIALIZE is None:
+        yield
+        return
+    linalg.initialize_lapack = lambda: None
+    try:
+        yield
+    finally:
+        linalg.initialize_lapack = _INITIALIZE
 
 
 def _device() -> Any:
@@ -175,7 +233,7 @@ def _device() -> Any:
 
 def _strong(leaf: Any) -> Any:
     """The argument with a type of its own, so that all calls share what was compiled."""
-    if hasattr(leaf, "dtype") and not getattr(leaf, "weak_type", False):
+    if isinstance(leaf, jax.Array) and not getattr(leaf, "weak_type", False):
         return leaf
     return np.asarray(leaf, jax.dtypes.canonicalize_dtype(jnp.result_type(leaf)))
 

@@ -50,6 +50,12 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`drive`."""
+    from countersteer.compiling import configure_jax
+
+    configure_jax(batches=False, cores=2)
+    from countersteer import kept_programs
+
+    kept_programs.preload("drive")
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import for_another_car

@@ -18,6 +18,7 @@ TRACED = 0.9  # s by when the loop has been traced, which needs Python, and is b
 
 def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
+    from countersteer import kept_programs
     from countersteer.compiling import configure_jax
     from countersteer.recorded_drive import drive
     from countersteer.runs.recorder import new_folder
@@ -35,12 +36,14 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
         result = drive(what, folder, progress.show)
     beside.join()
     view = view_of(read_run(folder))
-    (folder / "report.html").write_text(report_html(view))
     painter.draw(view)
+    (folder / "report.html").write_text(report_html(view))
+    kept_programs.remember("drive")
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
     else:
         print_result(result, folder)
+    painter.finish()
     if result["outcome"] == "interrupted":
         print("countersteer: interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -1,10 +1,12 @@
 """One drive at a glance, as a picture."""
 
+import io
 import json
 import math
 import pathlib
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -83,7 +85,7 @@ def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
     metres_per_width = _draw_floor(figure, layout.floor, view, colours, colours_end)
     _draw_keys(figure, layout.floor, colours, colours_end, metres_per_width)
     _draw_strips(figure, layout.strips, view)
-    canvas.print_png(str(path))
+    canvas.print_png(str(path), pil_kwargs={"compress_level": 1})
 
 
 def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
@@ -451,15 +453,28 @@ class Painter:
         )
 
     def draw(self, view: dict[str, Any]) -> None:
-        """Run `draw_picture` in the process. Raises `OSError` with the reason if it fails."""
-        _, errors = self._process.communicate(json.dumps(view))
+        """Begins `draw_picture`, over there."""
+        assert self._process.stdin is not None
+        self._view = json.dumps(view)
+        self._thread = threading.Thread(target=self._send)
+        self._thread.start()
+
+    def _send(self) -> None:
+        self._answer = self._process.communicate(self._view)
+
+    def finish(self) -> None:
+        """Waits until it is drawn. Raises `OSError` with the reason if it failed."""
+        self._thread.join()
         if self._process.returncode:
-            raise OSError(f"the picture was not drawn: {errors.strip().splitlines()[-1]}")
+            words = self._answer[1].strip().splitlines()[-1]
+            raise OSError(f"the picture was not drawn: {words}")
 
 
 if __name__ == "__main__":
-    import matplotlib.figure  # noqa: F401  # before the view arrives
-
+    # While the view is waited for: imports, fonts and the rest of a first drawing.
+    figure, canvas = new_figure(1, 1)
+    figure.add_axes((0.3, 0.3, 0.6, 0.6)).set_title("first", weight="bold")
+    canvas.print_png(io.BytesIO())
     text = sys.stdin.read()
     if text:
         draw_picture(json.loads(text), pathlib.Path(sys.argv[1]))
