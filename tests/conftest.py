@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from countersteer import kept_programs
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
 from countersteer.compiling import configure_jax
@@ -49,6 +50,7 @@ def programs() -> Iterator[None]:
     """Each file's compiled programs go with it: hundreds in one process have crashed XLA 0.10.2."""
     yield
     jax.clear_caches()
+    kept_programs.forget()
     gc.collect()
 
 

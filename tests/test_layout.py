@@ -10,7 +10,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "countersteer"
 
-EVERYONE = {"errors", "text", "progress", "signals", "random_streams", "compiling", "kept_programs", "cache"}
+EVERYONE = {
+    "errors", "text", "progress", "signals", "random_streams", "compiling", "kept_programs",
+    "cache",
+}  # fmt: skip
 MAY_IMPORT = {
     "car": set(),
     "course": {"car"},

@@ -32,9 +32,14 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     painter = Painter(folder / "report.png")
     beside = threading.Timer(TRACED, prepare_the_rest, args=(what,))
     beside.start()
-    with Progress(options.json) as progress:
-        result = drive(what, folder, progress.show)
-    beside.join()
+    try:
+        with Progress(options.json) as progress:
+            result = drive(what, folder, progress.show)
+    except BaseException:
+        painter.cancel()
+        raise
+    finally:
+        beside.join()
     view = view_of(read_run(folder))
     painter.draw(view)
     (folder / "report.html").write_text(report_html(view))

@@ -462,6 +462,10 @@ class Painter:
     def _send(self) -> None:
         self._answer = self._process.communicate(self._view)
 
+    def cancel(self) -> None:
+        """Nothing is drawn."""
+        self._process.communicate("")
+
     def finish(self) -> None:
         """Waits until it is drawn. Raises `OSError` with the reason if it failed."""
         self._thread.join()
