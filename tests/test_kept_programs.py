@@ -103,6 +103,7 @@ def test_a_program_can_be_loaded_ahead(monkeypatch):
     monkeypatch.setattr(kept_programs, "_coming", {})
     Kept(turned, (2,))(ASKED, 3.0, 2)
     kept_programs.remember("test")
+    monkeypatch.setattr(kept_programs, "_used", [])  # another process
     kept_programs.preload("test")
     (coming,) = kept_programs._coming.values()
     program = coming.result(timeout=60)

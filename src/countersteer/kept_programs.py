@@ -150,8 +150,11 @@ def preload(what: str) -> None:
     """
     try:
         last = json.loads((_folder() / f"{what}.json").read_text())["programs"]
-        wanted = [(str(w["key"]), jax.devices()[int(w["device"])], bool(w["wide"])) for w in last]
+        found = [(str(w["key"]), jax.devices()[int(w["device"])], bool(w["wide"])) for w in last]
+        wanted = list(dict.fromkeys(found))
     except (OSError, ValueError, KeyError, TypeError, IndexError):
+        return
+    if _used or _coming:  # this process has begun
         return
     for key, device, _ in wanted:
         _coming[key, device] = Future()
@@ -194,7 +197,9 @@ class _Program:
 def _find(key: str, device: Any) -> _Program | None:
     """A stored program, or one that is being loaded; None where there is none."""
     wide = jnp.result_type(float) == np.float64
-    _used.append({"key": key, "device": jax.devices().index(device), "wide": bool(wide)})
+    use = {"key": key, "device": jax.devices().index(device), "wide": bool(wide)}
+    if use not in _used:
+        _used.append(use)
     coming = _coming.get((key, device))
     found: _Program | None = coming.result() if coming is not None else None
     return found or _read(key, device)
