@@ -33,6 +33,7 @@ from countersteer.cache import cache_folder
 
 _INITIALIZE = getattr(linalg, "initialize_lapack", None)  # JAX has no public switch for it
 FORMAT = 1
+PATIENCE = 20.0  # s; a program that another thread loads for longer is loaded here
 PACKAGE = "countersteer"
 
 
@@ -201,7 +202,10 @@ def _find(key: str, device: Any) -> _Program | None:
     if use not in _used:
         _used.append(use)
     coming = _coming.get((key, device))
-    found: _Program | None = coming.result() if coming is not None else None
+    found: _Program | None = None
+    if coming is not None:
+        with contextlib.suppress(TimeoutError):
+            found = coming.result(timeout=PATIENCE)
     return found or _read(key, device)
 
 
