@@ -56,6 +56,7 @@ $(DRIVES): pyproject.toml constraints.txt
 $(READY): $(DRIVES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--constraint constraints.txt --editable '.[dev]'
+	@$(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null || true
 	@touch $(READY)
 
 clean:
