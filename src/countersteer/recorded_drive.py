@@ -25,7 +25,7 @@ from countersteer.sensing.all_sensors import channels
 from countersteer.sensing.faults import SensorFault, fault_tables
 from countersteer.signals import Motion, Wheels, truth_columns
 from countersteer.simulator import PIECE, Record, Simulator
-from countersteer.task.judge import PERIOD, Outcome, Sample, Task, summary
+from countersteer.task.judge import PERIOD, Outcome, Sample, Task, samples, summary
 from countersteer.world.floor import Floor, floor_tables
 
 VELOCITY = ("vx_mps", "vy_mps", "yaw_rate_radps")
@@ -208,7 +208,7 @@ def drive(
                 interrupt.begin()
                 shown = np.nonzero(record.tick % pace.truth == 0)[0]
                 shown = shown[record.tick[shown] * simulator.dt <= longest + 1e-9]
-                score, outcomes = task.follow(score, samples(simulator, record, shown))
+                score, outcomes = task.follow(score, samples(record, shown, simulator.dt))
                 over = np.nonzero(outcomes != Outcome.DRIVING.code)[0]
                 end = int(shown[over[0]]) + 1 if len(over) else len(record.tick)
                 last = np.searchsorted(record.tick * simulator.dt, longest + 1e-9, side="right")
@@ -237,12 +237,6 @@ def warm_up(what: Drive) -> None:
     parts: list[Any] = [*[zero] * 6, Wheels(*[zero] * 4), *[zero] * 5]
     still = Motion(*parts)
     task.follow(task.init(), Sample(zero, still, zero, zero, zero))
-
-
-def samples(simulator: Simulator, record: Record, rows: np.ndarray) -> Sample:
-    """The judge's samples of some rows of a record."""
-    own = jax.tree.map(lambda leaf: leaf[rows], (record.motion, *record[6:8], record.status.turn))
-    return Sample(record.tick[rows] * simulator.dt, *own)
 
 
 def frames(record: Record, end: int) -> Frames:

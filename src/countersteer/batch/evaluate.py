@@ -11,13 +11,13 @@ from scipy.stats import binomtest
 from countersteer.batch.engine import LANES
 from countersteer.batch.population import Drawn, Population, draw
 from countersteer.batch.separation import separation_line
-from countersteer.batch.trials import Watch, run_one_by_one, run_trials
+from countersteer.batch.trials import Watch, run_trials
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
 from countersteer.link.link import Link
-from countersteer.pilot import Pilot, traceable
+from countersteer.pilot import Pilot
 from countersteer.sensing.faults import SensorFault
 from countersteer.task.judge import DRIFT, Outcome, Score
 
@@ -78,21 +78,6 @@ class Trials:
             drivers = [made[speed] for speed in drawn.speed.tolist()]
         pilot = Pilot.of(drivers[0], self.course, self.nominal, self.estimate, self.link, self.dt)
         longest = 3.0 + (self.course.lap_end(self.laps) or 0.0) / SLOWEST
-        if not traceable(drivers[0]):
-            if watch is not None or faults:
-                raise InputError("a driver in Python cannot be watched, and has no failing sensors")
-            alone = run_one_by_one(
-                self.course,
-                pilot,
-                drawn,
-                drivers,
-                self.seeds,
-                self.laps,
-                longest,
-                report,
-                self.link,
-            )
-            return alone, ()
         return run_trials(
             self.course,
             pilot,

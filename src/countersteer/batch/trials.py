@@ -23,12 +23,12 @@ from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
-from countersteer.pilot import Pilot, PilotMemory
+from countersteer.pilot import Pilot, PilotMemory, traceable
 from countersteer.sensing import all_sensors
 from countersteer.sensing.faults import SensorFault
 from countersteer.signals import Array, Scalar
 from countersteer.simulator import Loop, Simulator, begin, tick
-from countersteer.task.judge import PERIOD, Outcome, Sample, Score, Task
+from countersteer.task.judge import PERIOD, Outcome, Sample, Score, Task, samples
 from countersteer.world import planar
 from countersteer.world.floor import Floor
 
@@ -168,11 +168,19 @@ def run_trials(
     """Run one trial for each seed: its score, and the result of `watch` (`()` without one).
 
     Each seed has its row in `drawn`, and its driver in `drivers`, which replaces the pilot's own.
+    Drivers that JAX cannot trace drive one after another; they cannot be watched or have `faults`.
     The precision is that of the leaves of `drawn`. Leaves of `faults` and of the result have a
     leading axis of trials. Raises `InputError` if the course has no goal.
     """
     if course.goal_distance is None:
         raise InputError("trials need a course with a goal")
+    if not traceable(drivers[0]):
+        if watch is not None or faults:
+            raise InputError("a driver in Python cannot be watched, and has no failing sensors")
+        alone = _one_by_one(
+            course, pilot, drawn, drivers, seeds, laps, longest, report, link
+        )  # fmt: skip
+        return alone, ()
     dtype = np.asarray(drawn.charge).dtype
     first: Any = jax.tree.map(lambda leaf: leaf[0], drawn)
     simulator = Simulator.of(course, first.cars, link=link, dt=pilot.dt, floor=first.floor)
@@ -214,18 +222,11 @@ def run_trials(
     return whole
 
 
-def run_one_by_one(
-    course: Course,
-    pilot: Pilot,
-    drawn: Drawn,
-    drivers: Sequence[Driver],
-    seeds: Sequence[int],
-    laps: int,
-    longest: float,
-    report: Callable[[int, int], None] = lambda *_: None,
-    link: Link = ONBOARD,
-) -> Score:
-    """The scores of `run_trials`, for drivers that JAX cannot trace: one drive after another."""
+def _one_by_one(
+    course: Course, pilot: Pilot, drawn: Drawn, drivers: Sequence[Driver], seeds: Sequence[int],
+    laps: int, longest: float, report: Callable[[int, int], None], link: Link,
+) -> Score:  # fmt: skip
+    """The scores for drivers that JAX cannot trace: one drive after another."""
     scores, dtype = [], np.asarray(drawn.charge).dtype
     task = Task.of(course, laps, walls_end=True)
     for i, (driver, seed) in enumerate(zip(drivers, seeds, strict=True)):
@@ -243,12 +244,7 @@ def run_one_by_one(
         ) as pieces:
             for record in pieces:
                 rows = np.nonzero(record.tick % every == 0)[0]
-                motion, turn = jax.tree.map(
-                    lambda leaf, rows=rows: leaf[rows], (record.motion, record.status.turn)
-                )
-                events = (record.wall_contacts[rows], record.rolled_over[rows])
-                sample = Sample(record.tick[rows] * pilot.dt, motion, *events, turn)
-                score, _ = task.follow(score, sample)
+                score, _ = task.follow(score, samples(record, rows, pilot.dt))
                 if score.outcome != Outcome.DRIVING.code:
                     break
         if score.outcome == Outcome.DRIVING.code:

@@ -11,7 +11,7 @@ from countersteer.cli.options import (
     number,
     physics,
 )
-from countersteer.cli.recorded import record
+from countersteer.cli.recorded import record, set_up
 from countersteer.drivers import DRIVERS
 from countersteer.errors import InputError
 
@@ -50,12 +50,7 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`drive`."""
-    from countersteer.compiling import configure_jax
-
-    configure_jax(batches=False, cores=2)
-    from countersteer import kept_programs
-
-    kept_programs.preload("drive")
+    set_up(options)
     from countersteer.car.files import load_car
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import for_another_car

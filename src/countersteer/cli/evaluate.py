@@ -66,11 +66,11 @@ def run(options: argparse.Namespace) -> int:
         for i, name in enumerate(options.driver):
 
             def made(speed: float | None, name: str = name) -> Any:
-                made, tables = make_driver(
+                driver, tables = make_driver(
                     name, course, nominal, speed, options.laps, read_commands
                 )
                 notes[name] = for_another_car(tables, options.car)
-                return made
+                return driver
 
             def report(done: int, trials: int, before: int = i * options.trials) -> None:
                 progress.show(before + done, len(options.driver) * trials)
@@ -100,14 +100,15 @@ def run(options: argparse.Namespace) -> int:
     for line in evaluate.table_lines(found):
         print(line)
     print(f"picture: {picture}; every trial: {folder / 'trials.csv'}")
-    print(f"one trial again: {_again(options)}")
+    print(f"one trial again: {_again(options, found)}")
     return DONE
 
 
-def _again(options: argparse.Namespace) -> str:
-    """The command that drives the first failed trial, or the first, again."""
-    driver = options.driver[0]
-    words = ["countersteer", "drive", options.course, "--driver", driver, "--seed", options.seed]
+def _again(options: argparse.Namespace, found: dict[str, Any]) -> str:
+    """The command that drives the first failed trial again, or the first if none failed."""
+    failed = [(name, seed) for name in found for seed in found[name]["failed_seeds"]]
+    driver, seed = (failed or [(options.driver[0], options.seed)])[0]
+    words = ["countersteer", "drive", options.course, "--driver", driver, "--seed", seed]
     words += ["--cars", options.cars, "--car", options.car, "--laps", options.laps]
     words += ["--link", options.link, "--estimate", options.estimate, "--dt", f"{options.dt:g}"]
     words += [word for change in options.set for word in ("--set", change)]

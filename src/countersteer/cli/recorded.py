@@ -16,10 +16,18 @@ if TYPE_CHECKING:
 TRACED = 0.9  # s by when the loop has been traced, which needs Python, and is being compiled
 
 
+def set_up(options: argparse.Namespace) -> None:
+    """Sets JAX up for one drive, and loads the compiled programs of the verb's last one."""
+    from countersteer import kept_programs
+    from countersteer.compiling import configure_jax
+
+    configure_jax(batches=False, cores=2)
+    kept_programs.preload(options.verb)
+
+
 def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
     from countersteer import kept_programs
-    from countersteer.compiling import configure_jax
     from countersteer.recorded_drive import drive
     from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
@@ -27,7 +35,6 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     from countersteer.viewing.report import report_html
     from countersteer.viewing.view import view_of
 
-    configure_jax(batches=False, cores=2)
     folder = new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}")
     painter = Painter(folder / "report.png")
     beside = threading.Timer(TRACED, prepare_the_rest, args=(what,))
@@ -39,11 +46,12 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
         painter.cancel()
         raise
     finally:
+        beside.cancel()  # a drive that ended before it needs no help
         beside.join()
     view = view_of(read_run(folder))
     painter.draw(view)
     (folder / "report.html").write_text(report_html(view))
-    kept_programs.remember("drive")
+    kept_programs.remember(options.verb)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
     else:

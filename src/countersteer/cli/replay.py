@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from countersteer.cli.options import DONE, Verbs, number, physics
-from countersteer.cli.recorded import record
+from countersteer.cli.recorded import record, set_up
 from countersteer.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`replay`."""
+    if not options.compare:
+        set_up(options)
     from countersteer.car.files import load_car
     from countersteer.course.files import course_of_run
     from countersteer.drivers.registry import replay

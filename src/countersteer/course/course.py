@@ -101,11 +101,11 @@ def from_segments(
     Raises `InputError` if the segments do not make a corridor, and says what to write instead.
     """
     points, turns = _centre_line(name, [Segment(*s) for s in segments], closed)
-    walls = np.concatenate([_offset(points, closed, side * width / 2) for side in (1, -1)])
-    if not crosses:
-        _require_simple(name, points, closed)
-    else:
+    if crosses:
         walls = _opened(name, points, closed, width)
+    else:
+        walls = np.concatenate([_offset(points, closed, side * width / 2) for side in (1, -1)])
+        _require_simple(name, points, closed)
     course = Course(name, width, closed, points, walls, turns, (0.0, 0.0, 0.0), start[0], None)
     length = course.length
     if not 0 <= start[0] <= length:

@@ -70,6 +70,12 @@ class Sample(NamedTuple):
     turn: Scalar = 0  # turns begun, by the driver's own account: only recorded
 
 
+def samples(record: Any, rows: np.ndarray, dt: float) -> Sample:
+    """The samples of some rows of a `simulator.Record` whose ticks last `dt` (s)."""
+    happened = (record.motion, record.wall_contacts, record.rolled_over, record.status.turn)
+    return Sample(record.tick[rows] * dt, *jax.tree.map(lambda leaf: leaf[rows], happened))
+
+
 class Score(NamedTuple):
     """The result of a drive so far."""
 
