@@ -11,6 +11,7 @@ nothing, and imports only classes of this package.
 """
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import importlib
@@ -26,7 +27,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src.export._export import _module_to_bytecode as _serialized
+from jax._src.interpreters.mlir import make_ir_context
 from jax._src.lax import linalg
+from jaxlib.mlir import ir
+from jaxlib.mlir.passmanager import PassManager
 
 import countersteer
 from countersteer.cache import cache_folder
@@ -122,6 +127,7 @@ class Kept:
         structure = _described(jax.tree.unflatten(result[0], range(result[0].num_leaves)))
         if structure is None:
             return None
+        exported = _without_places(exported)
         head = json.dumps({"format": FORMAT, "result": structure}).encode()
         with contextlib.suppress(OSError):  # a cache that cannot be written is no cache
             _write(key, len(head).to_bytes(8, "little") + head + exported.serialize())
@@ -193,6 +199,17 @@ class _Program:
         run = jax.jit(exported.call, in_shardings=here, out_shardings=here)
         with _without_lapack(exported):
             self.run = run.lower(*types).compile()
+
+
+def _without_places(exported: Any) -> Any:
+    """The program without the places in the source: they are a third of what XLA has to load."""
+    try:
+        with make_ir_context():
+            module = ir.Module.parse(exported.mlir_module())
+            PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
+            return dataclasses.replace(exported, mlir_module_serialized=_serialized(module))
+    except Exception:  # JAX has no public way to do it: if it changes, the program is larger
+        return exported
 
 
 def _find(key: str, device: Any) -> _Program | None:

@@ -27,7 +27,7 @@ from countersteer.pilot import Pilot, PilotMemory, traceable
 from countersteer.sensing import all_sensors
 from countersteer.sensing.faults import SensorFault
 from countersteer.signals import Array, Scalar
-from countersteer.simulator import Loop, Simulator, begin, tick
+from countersteer.simulator import PIECE, Loop, Simulator, begin, tick
 from countersteer.task.judge import PERIOD, Outcome, Sample, Score, Task, samples
 from countersteer.world import planar
 from countersteer.world.floor import Floor
@@ -53,7 +53,6 @@ class Shared(NamedTuple):
     simulator: Simulator  # without the parts that each trial has of its own
     pilot: Pilot  # without its driver
     task: Task
-    ticks: Scalar  # largest number of ticks
     watch: Any = None
 
 
@@ -83,27 +82,63 @@ class Watch(Protocol):
         ...
 
 
-@partial(jax.jit, static_argnums=0)
-def _block(mesh: Mesh, own: Trial, driver: Any, shared: Shared) -> tuple[Score, Any]:
-    """Run a block of trials on each core. `driver` holds None where the trials' drivers differ."""
+class Going(NamedTuple):
+    """A trial under way."""
 
-    def on_core(own: Trial, driver: Any, shared: Shared) -> tuple[Score, Any]:
-        def one(own: Trial) -> tuple[Score, Any]:
+    loop: Loop  # without its tick: one that differs by trial would make all compute every branch
+    memory: PilotMemory
+    score: Score
+    kept: Any  # by the watch
+
+
+def _on_cores(one: Callable[..., Any], mesh: Mesh, driver: Any, *lanes: Any) -> Any:
+    """The results of `one(trial, …)` for the trials of a block, a share on each core.
+
+    `lanes` begins with the trials; `driver` is None where theirs differ.
+    """
+
+    def on_core(driver: Any, own: Trial, *more: Any) -> Any:
+        def alone(own: Trial, *more: Any) -> Any:
             mine = jax.tree.map(
                 lambda a, b: b if a is None else a, driver, own.driver, is_leaf=lambda x: x is None
             )
-            return _trial(shared, own._replace(driver=mine))
+            return one(own._replace(driver=mine), *more)
 
-        return jax.vmap(one, axis_name="trial")(own)
+        return jax.vmap(alone, axis_name="trial")(own, *more)
 
-    run = engine.on_cores(on_core, mesh, (True, False, False))
-    found: tuple[Score, Any] = run(own, driver, shared)
-    return found
+    return engine.on_cores(on_core, mesh, (False, *(True for _ in lanes)))(driver, *lanes)
 
 
-def _trial(shared: Shared, own: Trial) -> tuple[Score, Any]:
-    """Run one trial of a block."""
-    task, watch = shared.task, shared.watch
+@partial(jax.jit, static_argnums=0)
+def _begin(mesh: Mesh, driver: Any, own: Trial, shared: Shared) -> Going:
+    """The trials of a block before their first tick."""
+
+    def one(own: Trial) -> Going:
+        simulator, pilot = _assembled(shared, own)
+        loop, memory = begin(simulator), pilot.init(simulator.root)
+        first = Instant(simulator, pilot, loop, memory, shared.task.init())
+        kept = () if shared.watch is None else shared.watch.begin(first)
+        return Going(loop._replace(tick=None), memory, first.score, kept)
+
+    going: Going = _on_cores(one, mesh, driver, own)
+    return going
+
+
+@partial(jax.jit, static_argnums=0)
+def _go_on(
+    mesh: Mesh, driver: Any, own: Trial, going: Going, shared: Shared, span: tuple[Scalar, Scalar]
+) -> Going:
+    """The trials of a block from a tick to another, or until all of a core's have ended."""
+
+    def one(own: Trial, going: Going) -> Going:
+        return _drive(shared, *_assembled(shared, own), going, span)
+
+    gone: Going = _on_cores(one, mesh, driver, own, going)
+    return gone
+
+
+def _assembled(shared: Shared, own: Trial) -> tuple[Simulator, Pilot]:
+    """The simulator and the pilot of a trial."""
     world: Any = shared.simulator.world
     simulator = dataclasses.replace(
         shared.simulator,
@@ -114,19 +149,23 @@ def _trial(shared: Shared, own: Trial) -> tuple[Score, Any]:
         seed=own.seed,
         faults=own.faults,
     )
-    pilot = dataclasses.replace(shared.pilot, driver=own.driver)
+    return simulator, dataclasses.replace(shared.pilot, driver=own.driver)
+
+
+def _drive(
+    shared: Shared, simulator: Simulator, pilot: Pilot, going: Going, span: tuple[Scalar, Scalar]
+) -> Going:
+    """A trial of a block, driven and judged from a tick to another."""
+    task, watch = shared.task, shared.watch
     every = max(1, round(PERIOD / simulator.dt))
-    loop, memory = begin(simulator), pilot.init(simulator.root)
 
     def one(carry: tuple[Loop, PilotMemory], _: None) -> tuple[tuple[Loop, PilotMemory], None]:
         after = tick(simulator, pilot, *carry)
         return after[:2], None
 
-    first = Instant(simulator, pilot, loop, memory, task.init())
-    kept = () if watch is None else watch.begin(first)
-
-    def look(carry: tuple[Loop, PilotMemory, Score, Scalar, Any]) -> Any:
-        loop, memory, score, _, kept = carry
+    def look(carry: tuple[Scalar, Going, Scalar]) -> tuple[Scalar, Going, Scalar]:
+        count, (loop, memory, score, kept), _ = carry
+        loop = loop._replace(tick=count)
         if watch is not None:
             new = watch.look(Instant(simulator, pilot, loop, memory, score), kept)
             live = score.outcome == Outcome.DRIVING.code
@@ -136,19 +175,21 @@ def _trial(shared: Shared, own: Trial) -> tuple[Score, Any]:
         turn = jnp.asarray(pilot.status(memory).turn)
         score = task.update(score, Sample(time, motion, *events, turn))
         (loop, memory), _ = jax.lax.scan(one, (loop, memory), None, length=every)
-        # Common to the block, so that all its trials leave the loop together.
-        going = jax.lax.pmax((score.outcome == Outcome.DRIVING.code).astype(jnp.int32), "trial")
-        return loop, memory, score, going, kept
+        going = Going(loop._replace(tick=None), memory, score, kept)
+        return loop.tick, going, live_in_block(score)
 
-    def goes_on(carry: tuple[Loop, PilotMemory, Score, Scalar, Any]) -> Any:
-        return (carry[3] > 0) & (carry[0].tick <= shared.ticks)
+    def goes_on(carry: tuple[Scalar, Going, Scalar]) -> Any:
+        return (carry[2] > 0) & (carry[0] < span[1])
 
-    start = (loop, memory, first.score, jnp.int32(1), kept)
-    _, _, score, _, kept = jax.lax.while_loop(goes_on, look, start)
-    late = score.outcome == Outcome.DRIVING.code
-    return score._replace(outcome=jnp.where(late, jnp.int32(Outcome.LATE.code), score.outcome)), (
-        () if watch is None else watch.end(kept)
-    )
+    after: Going = jax.lax.while_loop(goes_on, look, (span[0], going, live_in_block(going.score)))[
+        1
+    ]
+    return after
+
+
+def live_in_block(score: Score) -> Scalar:
+    """1 while a trial of the block drives, so that all its trials leave the loop together."""
+    return jax.lax.pmax((score.outcome == Outcome.DRIVING.code).astype(jnp.int32), "trial")
 
 
 def run_trials(
@@ -197,7 +238,6 @@ def run_trials(
         simulator,
         _without(pilot.typed(dtype), "driver"),
         Task.of(course, laps, walls_end=True, dtype=dtype),
-        np.int32(round(longest / pilot.dt)),
         watch,
     )
     varied = Trial(
@@ -211,12 +251,23 @@ def run_trials(
     )
     mesh = engine.all_cores()
     count = len(seeds)
+    last, every = round(longest / pilot.dt), max(1, round(PERIOD / pilot.dt))
+    piece = max(1, round(PIECE / pilot.dt / every)) * every
     width = (lanes or (FEW if count <= FEW * mesh.size else engine.LANES)) * mesh.size
 
-    def run(block: Trial, _: Callable[[float], None]) -> tuple[Score, Any]:
+    def run(block: Trial, done: Callable[[float], None]) -> tuple[Score, Any]:
         with jax.enable_x64(dtype == np.float64):
-            found: tuple[Score, Any] = _block(mesh, block, common, shared)
-            return found
+            going, end, live = _begin(mesh, common, block, shared), 0, True
+            while live and end <= last:
+                span = np.int32(end), np.int32(min(end + piece, last + 1))
+                going, end = _go_on(mesh, common, block, going, shared, span), end + piece
+                driving = np.asarray(going.score.outcome) == Outcome.DRIVING.code
+                live = bool(np.any(driving))
+                done(float(np.mean(~driving)))
+            score = going.score
+            late = np.where(driving, Outcome.LATE.code, np.asarray(score.outcome))
+            score = score._replace(outcome=late.astype(np.int32))
+            return score, () if watch is None else jax.jit(jax.vmap(watch.end))(going.kept)
 
     whole: tuple[Score, Any] = engine.in_turn(run, varied, width, report)
     return whole
