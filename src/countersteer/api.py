@@ -28,6 +28,7 @@ from countersteer.runs.run import read_run
 from countersteer.viewing.picture import draw_picture
 from countersteer.viewing.report import report_html
 from countersteer.viewing.view import view_of
+from countersteer.writing import write_whole
 
 
 class Run:
@@ -128,13 +129,13 @@ def drive(
         charge=battery,
     )
     name = f"{Path(where.name).stem}-{what.about['driver']}"
-    folder = new_folder(None if out is None else Path(out), name)
-    with Progress() as progress:
-        record(what, folder, progress.show)
-    run = read_run(folder)
-    view = view_of(run)
-    (folder / "report.html").write_text(report_html(view))
-    draw_picture(view, folder / "report.png")
+    with new_folder(None if out is None else Path(out), name) as folder:
+        with Progress() as progress:
+            record(what, folder, progress.show)
+        run = read_run(folder)
+        view = view_of(run)
+        write_whole(folder / "report.html", report_html(view))
+        draw_picture(view, folder / "report.png")
     return Run(run)
 
 

@@ -15,7 +15,6 @@ import functools
 import hashlib
 import importlib
 import json
-import os
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +29,8 @@ from jax._src.lax import linalg
 
 import countersteer
 from countersteer.cache import cache_folder
+from countersteer.errors import InputError
+from countersteer.writing import write_whole
 
 _INITIALIZE = getattr(linalg, "initialize_lapack", None)  # JAX has no public switch for it
 FORMAT = 1
@@ -123,7 +124,7 @@ class Kept:
         if structure is None:
             return None
         head = json.dumps({"format": FORMAT, "result": structure}).encode()
-        with contextlib.suppress(OSError):  # a cache that cannot be written is no cache
+        with contextlib.suppress(OSError, InputError):  # a cache that cannot be written is no cache
             _write(key, len(head).to_bytes(8, "little") + head + exported.serialize())
         return _Program(exported, result[0], _device())
 
@@ -177,7 +178,7 @@ def remember(what: str) -> None:
     def size(one: dict[str, Any]) -> int:
         return (_folder() / one["key"]).stat().st_size
 
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, InputError):
         programs = sorted(_used, key=size, reverse=True)
         _write(f"{what}.json", json.dumps({"format": FORMAT, "programs": programs}).encode())
 
@@ -230,12 +231,9 @@ def _folder() -> Path:
 
 
 def _write(name: str, data: bytes) -> None:
-    """All or nothing, as two processes may write at once."""
-    folder = _folder()
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{name}.{os.getpid()}"
-    part.write_bytes(data)
-    part.replace(folder / name)
+    """Raises `OSError`, or `InputError` where something other than a file stands."""
+    _folder().mkdir(parents=True, exist_ok=True)
+    write_whole(_folder() / name, data)
 
 
 @contextlib.contextmanager

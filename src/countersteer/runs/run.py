@@ -71,12 +71,15 @@ def read_run(path: Path) -> Run:
     if not (path / "run.toml").exists():
         raise InputError(f"{path}: not a run: it has no run.toml")
     about = tables_of(read_text(path / "run.toml"), f"{path}/run.toml")
+    recorded = (path / "run.mcap").exists()  # no table that was written by hand
     telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
     return Run(
         path,
         about,
-        read_commands(path / "commands.csv"),
-        read_table(telemetry, ("time_s",)) if telemetry.exists() else None,
-        read_table(truth, ("time_s", "x_m", "y_m", "heading_rad")) if truth.exists() else None,
+        read_commands(path / "commands.csv", recorded),
+        read_table(telemetry, ("time_s",), recorded=recorded) if telemetry.exists() else None,
+        read_table(truth, ("time_s", "x_m", "y_m", "heading_rad"), recorded=recorded)
+        if truth.exists()
+        else None,
         read_summary(summary) if summary.exists() else {},
     )
