@@ -43,12 +43,12 @@ class Run:
         self.folder, self.about = folder.path, folder.about
         self.commands, self.telemetry = folder.commands, folder.telemetry
         self.columns: dict[str, np.ndarray] = folder.truth or {}
-        self._summary = folder.summary
+        self._summary, self._outcome = folder.summary, folder.outcome
 
     @property
     def outcome(self) -> str:
         """How the drive ended, in words."""
-        return str(self._summary.get("outcome", "not judged"))
+        return self._outcome
 
     @property
     def success(self) -> bool:

@@ -1,11 +1,13 @@
 """The command line: one file a verb, its options beside its handler. Parse, call, print."""
 
 import argparse
+import contextlib
 import gc
 import os
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from countersteer import __version__
 from countersteer.cache import cache_folder
@@ -21,6 +23,7 @@ from countersteer.cli import (
     listing,
     new,
     replay,
+    report,
     trials,
     tune,
 )
@@ -32,20 +35,25 @@ from countersteer.cli.options import (
     Parser,
     Progress,
     Verbs,
+    in_one_line,
 )
 from countersteer.errors import InputError
 from countersteer.progress import waiting
+from countersteer.writing import clean_up, naming
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "WRONG_INPUT", "Progress", "entry", "main"]
 
 VERBS = (
-    drive, evaluate, replay, importing, trials, experiment, learn, tune, export, bench, listing,
-    new, completing,
+    drive, evaluate, replay, importing, report, trials, experiment, learn, tune, export, bench,
+    listing, new, completing,
 )  # fmt: skip
 
 
 # They import JAX and compile, which takes seconds.
-LONG = {"drive", "evaluate", "replay", "trials", "experiment", "learn", "tune", "export", "bench"}
+LONG = {
+    "drive", "evaluate", "replay", "report", "trials", "experiment", "learn", "tune", "export",
+    "bench",
+}  # fmt: skip
 
 
 def parser() -> Parser:
@@ -67,12 +75,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     try:
         options = top.parse_args(given)
-        if options.verb not in LONG or options.json:
-            return int(options.run(options))
-        with waiting(_title(options), cache_folder() / "waits.json"):
-            return int(options.run(options))
+        told = options.verb in LONG and not options.json
+        wait = waiting(_title(options), cache_folder() / "waits.json")
+        with wait if told else contextlib.nullcontext():
+            status = int(options.run(options))
+        with naming(Path("standard output")):
+            sys.stdout.flush()
+        return status
     except InputError as error:
-        print(f"countersteer: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"countersteer: {in_one_line(error)}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
         print("countersteer: interrupted", file=sys.stderr)
@@ -100,13 +111,26 @@ def entry() -> None:
     """
 
     def leave(*_: object) -> None:
+        clean_up()
         os.write(2, b"countersteer: interrupted\n")
         os._exit(INTERRUPTED)
 
+    _open_streams()
     signal.signal(signal.SIGINT, leave)
     gc.set_threshold(100_000, 50, 50)  # a tenth of a short drive goes into looking for garbage
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's own log is for its developers
     status = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    with contextlib.suppress(OSError):  # of what could not be written, `main` has told
+        sys.stdout.flush()
+        sys.stderr.flush()
     os._exit(status)  # what JAX takes apart at an exit takes a tenth of a second
+
+
+def _open_streams() -> None:
+    """Give a closed stream to the null device, lest the next file that is opened has its number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            file = os.open(os.devnull, os.O_RDWR)
+            if file != number:
+                os.dup2(file, number)
+            setattr(sys, name, open(number, "r" if name == "stdin" else "w", closefd=False))  # noqa: SIM115  # as long as the process

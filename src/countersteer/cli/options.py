@@ -110,6 +110,11 @@ class Verbs:
         return kind
 
 
+def in_one_line(error: Exception) -> str:
+    """The message of an error without line breaks."""
+    return " ".join(str(error).split())
+
+
 def number(low: float, high: float, kind: type = float) -> Callable[[str], Any]:
     """A number within bounds."""
 

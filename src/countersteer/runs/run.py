@@ -35,6 +35,12 @@ class Run:
         )
 
     @property
+    def outcome(self) -> str:
+        """How the drive ended, in words. A drive whose process was killed is "not finished"."""
+        unknown = "not finished" if "pilot" in self.about else "not judged"
+        return str(self.summary.get("outcome", unknown))
+
+    @property
     def walls(self) -> np.ndarray:
         """Ends (x, y, x, y) of the course's walls (m): (n, 4)."""
         walls = self.about.get("course", {}).get("walls_m", [])

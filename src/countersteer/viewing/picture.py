@@ -116,11 +116,12 @@ def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: fl
         mood = INK
     figure.text(0.022, 0.914, verdict, color=mood, size=13, weight="bold", va="center")
     lap_time, times = summary.get("lap_time_s"), view["time_s"]
+    contacts = summary["wall_contacts"]
     facts = (
         ("drive time", f"{times[-1] - times[0]:.2f} s")
         if lap_time is None
         else ("lap time", f"{lap_time:.2f} s"),
-        ("wall contacts", f"{summary['wall_contacts']}"),
+        ("wall contacts", "–" if contacts is None else f"{contacts}"),
         ("largest sideslip", f"{largest_sideslip:.0f}°"),
     )
     for right, (name, value) in zip((0.718, 0.845, 0.978), facts, strict=True):
