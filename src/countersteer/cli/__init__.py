@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import gc
+import logging
 import os
 import signal
 import sys
@@ -35,6 +36,7 @@ from countersteer.cli.options import (
     Parser,
     Progress,
     Verbs,
+    complain,
     in_one_line,
 )
 from countersteer.errors import InputError
@@ -83,17 +85,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
         return status
     except InputError as error:
-        print(f"countersteer: {in_one_line(error)}", file=sys.stderr)
+        complain(in_one_line(error))
         return WRONG_INPUT
     except KeyboardInterrupt:
-        print("countersteer: interrupted", file=sys.stderr)
+        complain("interrupted")
         return INTERRUPTED
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
-        print(f"countersteer: {name}{error.strerror or error}", file=sys.stderr)
+        complain(f"{name}{error.strerror or error}")
         return FAILED
 
 
@@ -116,6 +118,8 @@ def entry() -> None:
         os._exit(INTERRUPTED)
 
     _open_streams()
+    # That it cannot keep its fonts between processes is no news for who drives.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     signal.signal(signal.SIGINT, leave)
     gc.set_threshold(100_000, 50, 50)  # a tenth of a short drive goes into looking for garbage
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's own log is for its developers

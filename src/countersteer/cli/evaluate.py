@@ -4,7 +4,6 @@ import argparse
 import json
 import os
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from countersteer.cli.options import (
     SPEEDS,
     Progress,
     Verbs,
+    complain,
     laps_and_link,
     number,
     physics,
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
                 scores[name] = trials.run(made, report)
         columns = drawn_columns(population, trials.drawn, course)
         for note in filter(None, notes.values()):
-            print(f"countersteer: {note}", file=sys.stderr)
+            complain(note)
         found = {}
         table: dict[str, Any] = {"driver": [], "seed": []}
         for name, score in scores.items():

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import math
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -113,6 +114,12 @@ class Verbs:
 def in_one_line(error: Exception) -> str:
     """The message of an error without line breaks."""
     return " ".join(str(error).split())
+
+
+def complain(message: str) -> None:
+    """Writes a line to standard error, if that can be written to."""
+    with contextlib.suppress(OSError):
+        print(f"countersteer: {message}", file=sys.stderr, flush=True)
 
 
 def number(low: float, high: float, kind: type = float) -> Callable[[str], Any]:

@@ -2,12 +2,11 @@
 
 import argparse
 import json
-import sys
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from countersteer.cli.options import DONE, FAILED, INTERRUPTED, Progress
+from countersteer.cli.options import DONE, FAILED, INTERRUPTED, Progress, complain
 
 if TYPE_CHECKING:
     from countersteer.recorded_drive import Drive
@@ -65,7 +64,7 @@ def record_into(folder: Path, options: argparse.Namespace, what: "Drive") -> int
         print_result(result, folder)
     painter.finish(folder / "report.png")
     if result["outcome"] == "interrupted":
-        print("countersteer: interrupted", file=sys.stderr)
+        complain("interrupted")
         return INTERRUPTED
     return DONE if result["success"] else FAILED
 

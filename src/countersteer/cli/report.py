@@ -2,11 +2,10 @@
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
-from countersteer.cli.options import DONE, WRONG_INPUT, Verbs, in_one_line
+from countersteer.cli.options import DONE, WRONG_INPUT, Verbs, complain, in_one_line
 from countersteer.cli.recorded import set_up
 from countersteer.errors import InputError
 
@@ -29,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
             found.append(write_report(folder))
         except InputError as error:
             errors.append(in_one_line(error))
-            print(f"countersteer: {errors[-1]}", file=sys.stderr)
+            complain(errors[-1])
         else:
             if not options.json:
                 print(f"{folder}: {found[-1]['verdict']}; report: {found[-1]['report']}")
