@@ -27,7 +27,7 @@ _OWN = re.compile(r"\.(.*)\.(\d+)-\d+\.part|\.(.*)\.lock")  # our names, but for
 _LONGEST = 200  # bytes of a name that can be made longer; systems allow 255
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
 _count = itertools.count()
-_mine: set[Path] = set()  # parts and locks that this process has made and not taken away
+_mine: dict[Path, Path] = {}  # parts and locks that this process has made, and what they are for
 
 
 class BusyError(InputError):
@@ -44,7 +44,8 @@ def whole(path: Path) -> Iterator[Path]:
     file, such as a device.
     """
     if path in _mine:
-        yield path
+        with naming(_mine[path]):
+            yield path
         return
     place = Path(os.path.realpath(path))  # a link stays a link
     if place.exists() and not place.is_file():
@@ -79,10 +80,13 @@ def write_together(files: Mapping[Path, str | bytes]) -> None:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let each `OSError` of the block name `path`."""
+    """Let an `OSError` of the block name `path`, unless it names another file than a part."""
     try:
         yield
     except OSError as error:
+        names = () if error.filename is None else Path(str(error.filename)).parts
+        if names and not any(map(_OWN.fullmatch, names)):
+            raise
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
 
 
@@ -95,7 +99,7 @@ def new_part(path: Path) -> Path:
             if found and found[1] == name and not _lives(int(found[2])):
                 remove(other)
     part = path.with_name(f".{name}.{os.getpid()}-{next(_count)}.part")
-    _mine.add(part)
+    _mine[part] = path
     return part
 
 
@@ -105,7 +109,7 @@ def remove(part: Path) -> None:
         shutil.rmtree(part, ignore_errors=True)
     else:
         part.unlink(missing_ok=True)
-    _mine.discard(part)
+    _mine.pop(part, None)
 
 
 def clean_up() -> None:
@@ -142,7 +146,7 @@ def alone(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be written: {reason}")
     if file is None:
         raise BusyError(f"{path}: another process is writing there")
-    _mine.add(lock)
+    _mine[lock] = path
     try:
         yield
     finally:
