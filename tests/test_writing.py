@@ -185,6 +185,82 @@ def test_a_folder_that_is_written_at_once_appears_at_its_end(tmp_path):
     assert sorted(os.listdir(out.parent)) == ["log", "log.1"]
 
 
+# Kills itself before the n-th step on the disk, for each n, until there are no more steps.
+KILLED_AT_EACH_STEP = """
+import os, pathlib, shutil, signal, sys
+from countersteer.runs.recorder import new_folder, whole_folder
+from countersteer.writing import write_whole
+
+STEPS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.listdir", "shutil.rmtree"}
+FILES = ("run.toml", "summary.json")
+room, out = pathlib.Path(sys.argv[1]) / "room", pathlib.Path(sys.argv[1]) / "room" / "run"
+make = {"new": lambda out: new_folder(out, "run"), "whole": whole_folder}[sys.argv[2]]
+
+def write(text):
+    with make(out) as folder:
+        for name in FILES:
+            write_whole(folder / name, text)
+
+def write_and_die(last):
+    steps = 0
+    def step(event, _):
+        nonlocal steps
+        steps += event in STEPS
+        if event in STEPS and steps == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+    sys.addaudithook(step)
+    write("new")
+    os._exit(0)
+
+for last in range(1, 200):
+    shutil.rmtree(room, ignore_errors=True)
+    write("before")
+    child = os.fork()
+    if not child:
+        write_and_die(last)
+    _, status = os.waitpid(child, 0)
+    found = [
+        [(folder / name).read_text() for name in FILES if (folder / name).exists()]
+        for folder in room.glob("run*")
+    ]
+    assert found.count(["before"] * 2) == 1, (last, found)
+    others = [texts for texts in found if texts != ["before"] * 2]
+    assert others in ([], [[]], [["new"]], [["new"] * 2]), (last, found)
+    assert sys.argv[2] == "new" or others in ([], [["new"] * 2]), (last, found)
+    write("after")  # what the kill left is in nobody's way
+    assert [(out / name).read_text() for name in FILES] == ["after"] * 2
+    if status == 0:
+        break
+    assert os.WTERMSIG(status) == signal.SIGKILL
+print(last)
+"""
+
+
+@pytest.mark.parametrize("kind", ["new", "whole"])
+def test_a_kill_at_any_step_leaves_the_run_before(tmp_path, kind):
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", KILLED_AT_EACH_STEP, str(tmp_path), kind],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 10
+
+
+def test_a_folder_in_which_nothing_was_written_goes_away(tmp_path):
+    def wrong(*names):
+        with new_folder(tmp_path / "run", "run") as folder:
+            for name in names:
+                write_whole(folder / name, "text")
+            raise InputError("wrong")
+
+    for names in ((), ("run.toml",), ()):
+        with pytest.raises(InputError, match="wrong"):
+            wrong(*names)
+    assert os.listdir(tmp_path) == ["run.1"]
+
+
 @pytest.mark.parametrize("make", [lambda out: new_folder(out, "run"), whole_folder])
 def test_processes_at_once_do_not_mix_their_files(tmp_path, make):
     """Threads have locks of their own, as processes do."""

@@ -54,6 +54,7 @@ def whole(path: Path) -> Iterator[Path]:
         if place.exists() and not os.access(place, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         part = new_part(place)
+        _mine[part] = path
         try:
             yield part
             _flush(part)

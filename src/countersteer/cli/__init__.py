@@ -132,9 +132,6 @@ def entry() -> None:
 
 def _open_streams() -> None:
     """Give a closed stream to the null device, lest the next file that is opened has its number."""
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:
-            file = os.open(os.devnull, os.O_RDWR)
-            if file != number:
-                os.dup2(file, number)
-            setattr(sys, name, open(number, "r" if name == "stdin" else "w", closefd=False))  # noqa: SIM115  # as long as the process
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # the lowest free number is this stream's
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115  # as long as the process

@@ -58,11 +58,18 @@ def new_folder(out: Path | None, name: str) -> Iterator[Path]:
     """Make an empty folder for results: `out`, or else a numbered one under `runs/`.
 
     No other process of this program writes there until the block ends. An existing result is kept
-    under another name, with the next free number. Raises `InputError` if another process writes
-    there, if the folder holds something other than a result, or if it cannot be made.
+    under another name, with the next free number. If the block raises an exception and nothing was
+    written, the folder goes away. Raises `InputError` if another process writes there, if the
+    folder holds something other than a result, or if it cannot be made.
     """
     with contextlib.ExitStack() as stack:
-        yield _numbered(Path("runs"), name, stack) if out is None else _made(out, stack)
+        folder = _numbered(Path("runs"), name, stack) if out is None else _made(out, stack)
+        try:
+            yield folder
+        except BaseException:
+            with contextlib.suppress(OSError):  # it is not empty
+                folder.rmdir()
+            raise
 
 
 @contextlib.contextmanager
