@@ -13,6 +13,7 @@ from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
 from countersteer.signals import Command
 from countersteer.world import planar
+from countersteer.writing import write_whole
 
 DURATION = 1.0  # s
 FINEST = 2e-5  # s, step of the converged solution
@@ -85,4 +86,4 @@ def table(names: tuple[str, ...]) -> str:
 
 if __name__ == "__main__":
     configure_jax()
-    Path(sys.argv[1]).write_text(table(("rx7", "jetracer", "jetracer-tape")))
+    write_whole(Path(sys.argv[1]), table(("rx7", "jetracer", "jetracer-tape")))

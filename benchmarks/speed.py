@@ -26,6 +26,7 @@ from countersteer.car.files import load_car
 from countersteer.progress import Progress
 from countersteer.signals import Command
 from countersteer.world import planar
+from countersteer.writing import whole, write_whole
 
 LARGE_DT = 5e-3  # s, largest step of docs/accuracy.md with a usable error
 GROWTH = (1, 8, 64, 512, 2048, 8192, 32768)  # cars
@@ -283,7 +284,8 @@ def draw(found: dict[str, Any], file: Path) -> None:
     axes.set(xlabel="cars", ylabel="million steps per second")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", loc="lower right", bbox_to_anchor=(1.0, 0.12))
-    figure.savefig(file, dpi=110)
+    with whole(file) as part:
+        figure.savefig(part, format="png", dpi=110)
     pyplot.close(figure)
 
 
@@ -291,7 +293,7 @@ def write_page(found: dict[str, Any], file: Path) -> None:
     """Write the page, and its picture beside it."""
     picture = file.with_suffix(".png")
     draw(found, picture)
-    file.write_text(page(found, picture.name))
+    write_whole(file, page(found, picture.name))
 
 
 if __name__ == "__main__":

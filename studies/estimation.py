@@ -35,6 +35,7 @@ from countersteer.sensing.faults import KINDS, SensorFault
 from countersteer.task.judge import PERIOD, Outcome, Score
 from countersteer.world import battery
 from countersteer.world.walls import padded
+from countersteer.writing import whole, write_whole
 from studies.watches import FIT, PARTICLES, SAMPLE, Errors, Places, anywhere
 
 SET, SPEEDS, COURSES = "around", (1.5, 3.0), ("box", "ess")
@@ -402,7 +403,8 @@ def draw_picture(squares: dict[str, np.ndarray], path: Path) -> None:
         one.set_ylim(0, None)
     axes[0].set_ylabel("normalised error squared")
     axes[0].legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=110)
+    with whole(path) as part:
+        figure.savefig(part, format="png", dpi=110)
     plt.close(figure)
 
 
@@ -495,7 +497,7 @@ def write(page: Path, name: str = "rx7", cars: int = CARS) -> None:
         failing=FAILING,
         **{study: "\n".join(lines) for study, lines in studies.items()},
     )
-    page.write_text(text)
+    write_whole(page, text)
 
 
 if __name__ == "__main__":

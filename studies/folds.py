@@ -22,6 +22,7 @@ from countersteer.runs.run import read_run
 from countersteer.tuning import fit, tune
 from countersteer.tuning.compare import compare
 from countersteer.tuning.windows import QUANTITIES
+from countersteer.writing import write_whole
 
 FOLDS = 3
 
@@ -141,7 +142,7 @@ def main(arguments: Sequence[str]) -> Any:
     with jax.enable_x64(True):
         logs, cars = read(base, [Path(path) for path in paths])
         found = cross_validate(logs, cars, Path(base).stem, lambda text: print(text, flush=True))
-        Path(out).write_text(page(logs, *found, base))
+        write_whole(Path(out), page(logs, *found, base))
 
 
 if __name__ == "__main__":

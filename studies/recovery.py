@@ -29,6 +29,7 @@ from countersteer.runs.run import Run, read_run
 from countersteer.simulator import Simulator
 from countersteer.tuning import fit
 from countersteer.tuning.tune import read_logs
+from countersteer.writing import write_whole
 
 BASE = "jetracer-tape"
 CARS = 20
@@ -158,4 +159,4 @@ if __name__ == "__main__":
         found += recovered(car, what)
         far = [f"{c.path} {c.off:.1f}" for c in found if c.determined and c.off > 3]
         print(f"car {car}: {time.monotonic() - began:.0f} s; beyond three: {far}", flush=True)
-        Path(sys.argv[1]).write_text(page(found, car + 1, what))
+        write_whole(Path(sys.argv[1]), page(found, car + 1, what))

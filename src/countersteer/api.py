@@ -28,6 +28,7 @@ from countersteer.runs.run import read_run
 from countersteer.viewing.picture import draw_picture
 from countersteer.viewing.report import report_html
 from countersteer.viewing.view import view_of
+from countersteer.writing import write_whole
 
 
 class Run:
@@ -42,12 +43,12 @@ class Run:
         self.folder, self.about = folder.path, folder.about
         self.commands, self.telemetry = folder.commands, folder.telemetry
         self.columns: dict[str, np.ndarray] = folder.truth or {}
-        self._summary = folder.summary
+        self._summary, self._outcome = folder.summary, folder.outcome
 
     @property
     def outcome(self) -> str:
         """How the drive ended, in words."""
-        return str(self._summary.get("outcome", "not judged"))
+        return self._outcome
 
     @property
     def success(self) -> bool:
@@ -128,13 +129,13 @@ def drive(
         charge=battery,
     )
     name = f"{Path(where.name).stem}-{what.about['driver']}"
-    folder = new_folder(None if out is None else Path(out), name)
-    with Progress() as progress:
-        record(what, folder, progress.show)
-    run = read_run(folder)
-    view = view_of(run)
-    (folder / "report.html").write_text(report_html(view))
-    draw_picture(view, folder / "report.png")
+    with new_folder(None if out is None else Path(out), name) as folder:
+        with Progress() as progress:
+            record(what, folder, progress.show)
+        run = read_run(folder)
+        view = view_of(run)
+        write_whole(folder / "report.html", report_html(view))
+        draw_picture(view, folder / "report.png")
     return Run(run)
 
 

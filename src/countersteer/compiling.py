@@ -3,10 +3,14 @@
 import os
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import jax
+from jax._src import lru_cache
 
 from countersteer.cache import cache_folder
+from countersteer.writing import write_whole
 
 
 def configure_jax(batches: bool = True, blocks: bool = False, cores: int = 1) -> None:
@@ -27,6 +31,26 @@ def configure_jax(batches: bool = True, blocks: bool = False, cores: int = 1) ->
     jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    _write_whole_entries()
+
+
+def _write_whole_entries() -> None:
+    """Have JAX write each entry of its cache whole, and in the place of one that it cannot read.
+
+    JAX (0.10) writes an entry where it is read, and never again. One that a kill has cut off would
+    be compiled anew in every later process. JAX has no public switch for it: where its cache has
+    another form, it stays as it is.
+    """
+    cache = getattr(lru_cache, "LRUCache", None)
+    suffix = getattr(lru_cache, "_CACHE_SUFFIX", None)
+    if cache is None or suffix is None or not hasattr(cache, "put"):
+        return
+
+    def put(self: Any, key: str, value: bytes) -> None:
+        """Called where the entry is missing or damaged. JAX takes an exception as a warning."""
+        write_whole(Path(str(self.path)) / f"{key}{suffix}", value)
+
+    cache.put = put
 
 
 def compiler_flags(

@@ -6,8 +6,8 @@ of this package, the versions of JAX, the function, and the types of its argumen
 part of it: another seed, or another car with the same parts, finds the same program. What the
 program compiles to is in JAX's own cache.
 
-A stored program is StableHLO, and the structure of its result as JSON. Reading one executes
-nothing, and imports only classes of this package.
+A stored program is StableHLO with its digest, and the structure of its result as JSON. Reading one
+executes nothing, and imports only classes of this package.
 """
 
 import contextlib
@@ -16,7 +16,6 @@ import functools
 import hashlib
 import importlib
 import json
-import os
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -35,9 +34,11 @@ from jaxlib.mlir.passmanager import PassManager
 
 import countersteer
 from countersteer.cache import cache_folder
+from countersteer.errors import InputError
+from countersteer.writing import write_whole
 
 _INITIALIZE = getattr(linalg, "initialize_lapack", None)  # JAX has no public switch for it
-FORMAT = 1
+FORMAT = 2
 PATIENCE = 20.0  # s; a program that another thread loads for longer is loaded here
 PACKAGE = "countersteer"
 
@@ -128,9 +129,11 @@ class Kept:
         if structure is None:
             return None
         exported = _without_places(exported)
-        head = json.dumps({"format": FORMAT, "result": structure}).encode()
-        with contextlib.suppress(OSError):  # a cache that cannot be written is no cache
-            _write(key, len(head).to_bytes(8, "little") + head + exported.serialize())
+        program = bytes(exported.serialize())
+        about = {"format": FORMAT, "result": structure, "sha256": _digest(program)}
+        head = json.dumps(about).encode()
+        with contextlib.suppress(OSError, InputError):  # a cache that cannot be written is no cache
+            _write(key, len(head).to_bytes(8, "little") + head + program)
         return _Program(exported, result[0], _device())
 
 
@@ -183,7 +186,7 @@ def remember(what: str) -> None:
     def size(one: dict[str, Any]) -> int:
         return (_folder() / one["key"]).stat().st_size
 
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, InputError):
         programs = sorted(_used, key=size, reverse=True)
         _write(f"{what}.json", json.dumps({"format": FORMAT, "programs": programs}).encode())
 
@@ -233,13 +236,19 @@ def _read(key: str, device: Any) -> _Program | None:
     try:
         data = (_folder() / key).read_bytes()
         size = int.from_bytes(data[:8], "little")
-        head = json.loads(data[8 : 8 + size])
+        head, program = json.loads(data[8 : 8 + size]), data[8 + size :]
+        if head["sha256"] != _digest(program):  # XLA may crash on a damaged one
+            return None
         tree = jax.tree.structure(_built(head["result"]))
-        return _Program(export.deserialize(bytearray(data[8 + size :])), tree, device)
+        return _Program(export.deserialize(bytearray(program)), tree, device)
     except FileNotFoundError:
         return None
     except Exception:  # cut off, or of another version: it is made again
         return None
+
+
+def _digest(program: bytes) -> str:
+    return hashlib.sha256(program).hexdigest()
 
 
 def _folder() -> Path:
@@ -247,12 +256,9 @@ def _folder() -> Path:
 
 
 def _write(name: str, data: bytes) -> None:
-    """All or nothing, as two processes may write at once."""
-    folder = _folder()
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{name}.{os.getpid()}"
-    part.write_bytes(data)
-    part.replace(folder / name)
+    """Raises `OSError`, or `InputError` where something other than a file stands."""
+    _folder().mkdir(parents=True, exist_ok=True)
+    write_whole(_folder() / name, data)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from countersteer.errors import InputError
+from countersteer.writing import write_whole
+
 STEP = 0.5  # s between two updates of the wait
 SHORTEST = 1.0  # s; a shorter wait is not remembered
 
@@ -91,10 +94,10 @@ class _Wait:
         self._out.flush()
         spent = time.monotonic() - self._begin
         if remember and spent > SHORTEST:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, InputError):
                 self._memory.parent.mkdir(parents=True, exist_ok=True)
                 text = json.dumps(_read(self._memory) | {self._what: round(spent, 1)})
-                self._memory.write_text(text)
+                write_whole(self._memory, text)
 
 
 class _First:

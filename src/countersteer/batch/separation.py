@@ -38,35 +38,27 @@ def drawn_columns(population: Population, drawn: Drawn, course: Course) -> dict[
 
 
 def result_columns(score: Score) -> dict[str, Sequence[Any]]:
-    """What came of each trial, by column."""
+    """What came of each trial, by column. NaN is what did not happen."""
     turns, begun = score.turns, np.isfinite(score.turns.begin)
 
     def worst(values: np.ndarray) -> np.ndarray:
-        return np.max(np.where(begun, np.abs(np.degrees(values)), -np.inf), axis=1, initial=-np.inf)
+        return known(
+            np.max(np.where(begun, np.abs(np.degrees(values)), -np.inf), axis=1, initial=-np.inf)
+        )
+
+    def known(values: np.ndarray) -> np.ndarray:
+        return np.where(np.isfinite(values), values, np.nan)
 
     return {
         "outcome": [Outcome.of(code).value for code in score.outcome],
         "success": (score.outcome == Outcome.REACHED.code).astype(int),
-        "lap_time_s": score.goal_time,
+        "lap_time_s": known(score.goal_time),
         "turns": begun.sum(axis=1),
         "drifts": (begun & (turns.peak_sideslip > DRIFT)).sum(axis=1),
         "peak_sideslip_deg": worst(turns.peak_sideslip),
         "heading_error_deg": worst(turns.error),
         "heading_overshoot_deg": worst(turns.overshoot),
     }
-
-
-def rows(columns: Mapping[str, Sequence[Any] | np.ndarray]) -> str:
-    """The text of a CSV. What is not finite is an empty cell."""
-
-    def cell(value: Any) -> str:
-        if isinstance(value, str):
-            return value
-        return f"{float(value):.7g}" if np.isfinite(value) else ""
-
-    lines = [",".join(columns)]
-    lines += [",".join(map(cell, row)) for row in zip(*columns.values(), strict=True)]
-    return "\n".join(lines) + "\n"
 
 
 def separation(columns: Mapping[str, np.ndarray], won: np.ndarray) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ from countersteer.car.parameter import (
 )
 from countersteer.errors import InputError
 from countersteer.text import read_toml, toml_of
+from countersteer.writing import write_whole
 
 LIBRARY = importlib.resources.files("countersteer.car") / "library"
 
@@ -148,7 +149,12 @@ def car_from_tables(tables: dict[str, Any], where: str) -> Car:
 
 def save_car(car: Car, path: Path, source: dict[str, str]) -> None:
     """Write all of a car. `source` says where each number is from."""
-    path.write_text(toml_of({"source": source, **car_tables(car)}))
+    write_whole(path, car_text(car, source))
+
+
+def car_text(car: Car, source: dict[str, str]) -> str:
+    """The text of `save_car`'s file."""
+    return toml_of({"source": source, **car_tables(car)})
 
 
 def parameters(car: Car | None = None) -> list[dict[str, Any]]:

@@ -1,11 +1,14 @@
 """The command line: one file a verb, its options beside its handler. Parse, call, print."""
 
 import argparse
+import contextlib
 import gc
+import logging
 import os
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from countersteer import __version__
 from countersteer.cache import cache_folder
@@ -21,6 +24,7 @@ from countersteer.cli import (
     listing,
     new,
     replay,
+    report,
     trials,
     tune,
 )
@@ -32,20 +36,26 @@ from countersteer.cli.options import (
     Parser,
     Progress,
     Verbs,
+    complain,
+    in_one_line,
 )
 from countersteer.errors import InputError
 from countersteer.progress import waiting
+from countersteer.writing import clean_up, naming
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "WRONG_INPUT", "Progress", "entry", "main"]
 
 VERBS = (
-    drive, evaluate, replay, importing, trials, experiment, learn, tune, export, bench, listing,
-    new, completing,
+    drive, evaluate, replay, importing, report, trials, experiment, learn, tune, export, bench,
+    listing, new, completing,
 )  # fmt: skip
 
 
 # They import JAX and compile, which takes seconds.
-LONG = {"drive", "evaluate", "replay", "trials", "experiment", "learn", "tune", "export", "bench"}
+LONG = {
+    "drive", "evaluate", "replay", "report", "trials", "experiment", "learn", "tune", "export",
+    "bench",
+}  # fmt: skip
 
 
 def parser() -> Parser:
@@ -67,22 +77,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     try:
         options = top.parse_args(given)
-        if options.verb not in LONG or options.json:
-            return int(options.run(options))
-        with waiting(_title(options), cache_folder() / "waits.json"):
-            return int(options.run(options))
+        told = options.verb in LONG and not options.json
+        wait = waiting(_title(options), cache_folder() / "waits.json")
+        with wait if told else contextlib.nullcontext():
+            status = int(options.run(options))
+        with naming(Path("standard output")):
+            sys.stdout.flush()
+        return status
     except InputError as error:
-        print(f"countersteer: {' '.join(str(error).split())}", file=sys.stderr)
+        complain(in_one_line(error))
         return WRONG_INPUT
     except KeyboardInterrupt:
-        print("countersteer: interrupted", file=sys.stderr)
+        complain("interrupted")
         return INTERRUPTED
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
-        print(f"countersteer: {name}{error.strerror or error}", file=sys.stderr)
+        complain(f"{name}{error.strerror or error}")
         return FAILED
 
 
@@ -100,13 +113,25 @@ def entry() -> None:
     """
 
     def leave(*_: object) -> None:
+        clean_up()
         os.write(2, b"countersteer: interrupted\n")
         os._exit(INTERRUPTED)
 
+    _open_streams()
+    # That it cannot keep its fonts between processes is no news for who drives.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     signal.signal(signal.SIGINT, leave)
     gc.set_threshold(100_000, 50, 50)  # a tenth of a short drive goes into looking for garbage
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's own log is for its developers
     status = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    with contextlib.suppress(OSError):  # of what could not be written, `main` has told
+        sys.stdout.flush()
+        sys.stderr.flush()
     os._exit(status)  # what JAX takes apart at an exit takes a tenth of a second
+
+
+def _open_streams() -> None:
+    """Give a closed stream to the null device, lest the next file that is opened has its number."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # the lowest free number is this stream's
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115  # as long as the process

@@ -1,12 +1,12 @@
 """`drive`: one closed-loop drive over a course."""
 
 import argparse
-import sys
 from typing import TYPE_CHECKING, Any
 
 from countersteer.cli.options import (
     SPEEDS,
     Verbs,
+    complain,
     laps_and_link,
     number,
     physics,
@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     )
     note = for_another_car(drive.about["pilot"], options.car)
     if note:
-        print(f"countersteer: {note}", file=sys.stderr)
+        complain(note)
     return record(options, drive, course.name)
 
 

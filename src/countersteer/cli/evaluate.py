@@ -4,7 +4,6 @@ import argparse
 import json
 import os
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,13 @@ from countersteer.cli.options import (
     SPEEDS,
     Progress,
     Verbs,
+    complain,
     laps_and_link,
     number,
     physics,
 )
+
+DIGITS = 7  # of numbers in trials.csv
 
 
 def add(verbs: Verbs) -> None:
@@ -39,17 +41,18 @@ def run(options: argparse.Namespace) -> int:
 
     from countersteer.batch import evaluate
     from countersteer.batch.population import load_population
-    from countersteer.batch.separation import drawn_columns, result_columns, rows, separation
+    from countersteer.batch.separation import drawn_columns, result_columns, separation
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import for_another_car
     from countersteer.drivers.registry import make_driver
     from countersteer.link.link import LINKS
-    from countersteer.runs.files import read_commands
+    from countersteer.runs.files import csv_text, read_commands
     from countersteer.runs.recorder import new_folder
     from countersteer.task.judge import Outcome
     from countersteer.viewing.evaluation import draw_evaluation
+    from countersteer.writing import whole, write_whole
 
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     course, car = load_course(options.course), load_car(options.car, options.set)
@@ -59,41 +62,45 @@ def run(options: argparse.Namespace) -> int:
         course, car, nominal, population, seeds, options.speed_mps, options.laps,
         LINKS[options.link], options.estimate, options.dt,
     )  # fmt: skip
-    folder = new_folder(options.out, f"{Path(options.course).stem}-evaluate")
-    scores: dict[str, Any] = {}
-    notes: dict[str, str | None] = {}
-    with Progress(options.json) as progress:
-        for i, name in enumerate(options.driver):
+    with new_folder(options.out, f"{Path(options.course).stem}-evaluate") as folder:
+        scores: dict[str, Any] = {}
+        notes: dict[str, str | None] = {}
+        with Progress(options.json) as progress:
+            for i, name in enumerate(options.driver):
 
-            def made(speed: float | None, name: str = name) -> Any:
-                driver, tables = make_driver(
-                    name, course, nominal, speed, options.laps, read_commands
-                )
-                notes[name] = for_another_car(tables, options.car)
-                return driver
+                def made(speed: float | None, name: str = name) -> Any:
+                    driver, tables = make_driver(
+                        name, course, nominal, speed, options.laps, read_commands
+                    )
+                    notes[name] = for_another_car(tables, options.car)
+                    return driver
 
-            def report(done: int, trials: int, before: int = i * options.trials) -> None:
-                progress.show(before + done, len(options.driver) * trials)
+                def report(done: int, trials: int, before: int = i * options.trials) -> None:
+                    progress.show(before + done, len(options.driver) * trials)
 
-            scores[name] = trials.run(made, report)
-    columns = drawn_columns(population, trials.drawn, course)
-    for note in filter(None, notes.values()):
-        print(f"countersteer: {note}", file=sys.stderr)
-    found = {}
-    table: dict[str, Any] = {"driver": [], "seed": []}
-    for name, score in scores.items():
-        won = np.asarray(score.outcome == Outcome.REACHED.code)
-        found[name] = evaluate.results(score, seeds) | {"separated_by": separation(columns, won)}
-        results = result_columns(score)
-        for key, values in {"seed": seeds, **columns, **results}.items():
-            table.setdefault(key, []).extend(values)
-        table["driver"] += [name] * len(seeds)
-    (folder / "trials.csv").write_text(rows(table))
-    result = trials.about() | {"car": options.car, "drivers": found}
-    (folder / "evaluate.json").write_text(json.dumps(result, indent=1) + "\n")
-    picture = folder / "evaluate.png"
-    title = f"{course.name}, {options.car}, {options.trials} trials"
-    draw_evaluation(scores, title, picture)
+                scores[name] = trials.run(made, report)
+        columns = drawn_columns(population, trials.drawn, course)
+        for note in filter(None, notes.values()):
+            complain(note)
+        found = {}
+        table: dict[str, Any] = {"driver": [], "seed": []}
+        for name, score in scores.items():
+            won = np.asarray(score.outcome == Outcome.REACHED.code)
+            found[name] = evaluate.results(score, seeds) | {
+                "separated_by": separation(columns, won)
+            }
+            results = result_columns(score)
+            for key, values in {"seed": seeds, **columns, **results}.items():
+                table.setdefault(key, []).extend(values)
+            table["driver"] += [name] * len(seeds)
+        result = trials.about() | {"car": options.car, "drivers": found}
+        picture = folder / "evaluate.png"
+        title = f"{course.name}, {options.car}, {options.trials} trials"
+        with whole(folder / "evaluate.json") as told, whole(folder / "trials.csv") as listed:
+            write_whole(told, json.dumps(result, indent=1) + "\n")
+            rows = zip(*table.values(), strict=True)
+            write_whole(listed, csv_text(list(table), rows, DIGITS))
+            draw_evaluation(scores, title, picture)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
         return DONE

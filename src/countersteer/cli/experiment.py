@@ -36,13 +36,13 @@ def run(options: argparse.Namespace) -> int:
     module, car = experiments.load(options.name), load_car(options.car, options.set)
     if options.runs and not hasattr(module, "measure"):
         raise InputError(f"--from: {options.name} is simulated, and measures no run")
-    folder = new_folder(options.out, options.name)
-    with Progress(options.json) as progress:
-        if options.runs:
-            found = module.measure([read_run(path) for path in options.runs])
-        else:
-            found = module.simulate(car, Path(options.car).stem, progress.show)
-    result = write(found, folder, options.name)
+    with new_folder(options.out, options.name) as folder:
+        with Progress(options.json) as progress:
+            if options.runs:
+                found = module.measure([read_run(path) for path in options.runs])
+            else:
+                found = module.simulate(car, Path(options.car).stem, progress.show)
+        result = write(found, folder, options.name)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
     else:

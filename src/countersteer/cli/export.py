@@ -7,6 +7,7 @@ from pathlib import Path
 
 from countersteer.cli.options import DONE, Progress, Verbs, number
 from countersteer.errors import InputError
+from countersteer.writing import alone
 
 FASTEST_GIF = 50  # frames a second
 
@@ -34,16 +35,24 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`export`."""
-    from countersteer.runs.run import read_run
-    from countersteer.viewing.animation import Animation, Options, export
-
     kind, file = ("gif", options.gif) if options.gif else ("mp4", options.mp4)
     if file.is_dir():
         raise InputError(f"{file}: is a folder: name a file")
-    if file.exists() and not options.force:
-        raise InputError(f"{file}: is there already: give another name, or --force to replace it")
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder")
+    with alone(file):
+        if file.exists() and not options.force:
+            raise InputError(
+                f"{file}: is there already: give another name, or --force to replace it"
+            )
+        return animate(options, kind, file)
+
+
+def animate(options: argparse.Namespace, kind: str, file: Path) -> int:
+    """The animation of a run, as a file."""
+    from countersteer.runs.run import read_run
+    from countersteer.viewing.animation import Animation, Options, export
+
     fps = options.fps or {"gif": 20.0, "mp4": 25.0}[kind]
     if kind == "gif" and fps > FASTEST_GIF:
         raise InputError(f"--fps must be at most {FASTEST_GIF} for a GIF: viewers slow others down")

@@ -6,8 +6,7 @@ import math
 import os
 from pathlib import Path
 
-from countersteer.cli.options import DONE, Verbs, number
-from countersteer.errors import InputError
+from countersteer.cli.options import DONE, Verbs, number, out_file
 
 
 def add(verbs: Verbs) -> None:
@@ -38,16 +37,23 @@ def add(verbs: Verbs) -> None:
 
 def run_stop_angle(options: argparse.Namespace) -> int:
     """`learn stop-angle`."""
+    with out_file(options.out):
+        return learn_stop_angle(options)
+
+
+def learn_stop_angle(options: argparse.Namespace) -> int:
+    """The regression over turns that were stopped."""
     from countersteer.experiments import stop_regression
     from countersteer.learning.stop_angle import learn
+    from countersteer.writing import whole, write_whole
 
-    if options.out.suffix != ".toml":
-        raise InputError(f"--out {options.out}: name a .toml file")
-    found = learn(options.sources, math.radians(options.most_deg), options.out)
-    result, picture = stop_regression.about(found), options.out.with_suffix(".png")
-    options.out.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    names = ", ".join(path.name for path in options.sources)
-    stop_regression.draw(found, picture, f"{result['turns']} turns of {names}"[:90])
+    picture = options.out.with_suffix(".png")
+    with whole(options.out) as policy, whole(picture) as drawn:
+        found = learn(options.sources, math.radians(options.most_deg), policy)
+        result = stop_regression.about(found)
+        names = ", ".join(path.name for path in options.sources)
+        stop_regression.draw(found, drawn, f"{result['turns']} turns of {names}"[:90])
+        write_whole(options.out.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
     if options.json:
         print(json.dumps(result | {"policy": str(options.out), "picture": str(picture)}))
         return DONE
@@ -58,6 +64,12 @@ def run_stop_angle(options: argparse.Namespace) -> int:
 
 def run_turn(options: argparse.Namespace) -> int:
     """`learn turn`."""
+    with out_file(options.out):
+        return learn_turn(options)
+
+
+def learn_turn(options: argparse.Namespace) -> int:
+    """The search for the numbers of a turn."""
     from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
@@ -65,8 +77,6 @@ def run_turn(options: argparse.Namespace) -> int:
     from countersteer.drivers.policy import load_policy, save_policy
     from countersteer.learning.turning import Generation, search
 
-    if options.out.suffix != ".toml":
-        raise InputError(f"--out {options.out}: name a .toml file")
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     courses = [load_course(name) for name in options.courses]
     history: list[dict[str, float]] = []

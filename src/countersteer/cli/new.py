@@ -8,6 +8,7 @@ from pathlib import Path
 
 from countersteer.cli.options import DONE, Verbs
 from countersteer.errors import InputError
+from countersteer.writing import alone, write_whole
 
 TEMPLATES = {"driver": "driver.py", "course": "course.toml"}
 
@@ -28,8 +29,6 @@ def run(options: argparse.Namespace) -> int:
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
         raise InputError(f"new: NAME must be letters, digits, - and _, not {options.name}")
     file = Path(name + suffix)
-    if file.exists():
-        raise InputError(f"{file}: is there already: give another name")
     text = (importlib.resources.files("countersteer.cli.templates") / template).read_text()
     title = "".join(part.capitalize() for part in re.split("[-_]", name))
     text = text.replace("FILE", str(file)).replace("NAME", name)
@@ -38,7 +37,10 @@ def run(options: argparse.Namespace) -> int:
         command = f"countersteer drive box --driver {file}:{title}"
     else:
         command = f"countersteer drive {file}"
-    file.write_text(text)
+    with alone(file):
+        if file.exists():
+            raise InputError(f"{file}: is there already: give another name")
+        write_whole(file, text)
     if options.json:
         print(json.dumps({"file": str(file), "try": command}))
     else:

@@ -1,15 +1,18 @@
 """What verbs share: the parser, exit statuses, options that several have, the progress bar."""
 
 import argparse
+import contextlib
 import math
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
 from countersteer.errors import InputError
 from countersteer.progress import Progress
 from countersteer.text import nearest
+from countersteer.writing import alone
 
 __all__ = ["Progress"]  # and all else that is defined here
 
@@ -64,6 +67,22 @@ class Parser(argparse.ArgumentParser):
         self.option("--seed", None, number(0, 2**31 - 1, int), 0, "of all that is random")
 
 
+@contextlib.contextmanager
+def out_file(path: Path) -> Iterator[None]:
+    """Keep other processes from a `.toml` file and what is written beside it; make its folder.
+
+    Raises `InputError` if it has another name, or if nothing can be written there.
+    """
+    if path.suffix != ".toml":
+        raise InputError(f"--out {path}: name a .toml file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {path}: {error.strerror}") from None
+    with alone(path):
+        yield
+
+
 class Verbs:
     """The verbs of a parser; each file of this room adds its own."""
 
@@ -90,6 +109,17 @@ class Verbs:
             return part
 
         return kind
+
+
+def in_one_line(error: Exception) -> str:
+    """The message of an error without line breaks."""
+    return " ".join(str(error).split())
+
+
+def complain(message: str) -> None:
+    """Writes a line to standard error, if that can be written to."""
+    with contextlib.suppress(OSError):
+        print(f"countersteer: {message}", file=sys.stderr, flush=True)
 
 
 def number(low: float, high: float, kind: type = float) -> Callable[[str], Any]:

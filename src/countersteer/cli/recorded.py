@@ -2,12 +2,11 @@
 
 import argparse
 import json
-import sys
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from countersteer.cli.options import DONE, FAILED, INTERRUPTED, Progress
+from countersteer.cli.options import DONE, FAILED, INTERRUPTED, Progress, complain
 
 if TYPE_CHECKING:
     from countersteer.recorded_drive import Drive
@@ -27,16 +26,23 @@ def set_up(options: argparse.Namespace) -> None:
 
 def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
+    from countersteer.runs.recorder import new_folder
+
+    with new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}") as folder:
+        return record_into(folder, options, what)
+
+
+def record_into(folder: Path, options: argparse.Namespace, what: "Drive") -> int:
+    """`record`, in a new folder."""
     from countersteer import kept_programs
     from countersteer.recorded_drive import drive
-    from countersteer.runs.recorder import new_folder
     from countersteer.runs.run import read_run
     from countersteer.viewing.picture import Painter
     from countersteer.viewing.report import report_html
     from countersteer.viewing.view import view_of
+    from countersteer.writing import write_whole
 
-    folder = new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}")
-    painter = Painter(folder / "report.png")
+    painter = Painter()
     beside = threading.Timer(TRACED, prepare_the_rest, args=(what,))
     beside.start()
     try:
@@ -50,15 +56,15 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
         beside.join()
     view = view_of(read_run(folder))
     painter.draw(view)
-    (folder / "report.html").write_text(report_html(view))
+    write_whole(folder / "report.html", report_html(view))
     kept_programs.remember(options.verb)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
     else:
         print_result(result, folder)
-    painter.finish()
+    painter.finish(folder / "report.png")
     if result["outcome"] == "interrupted":
-        print("countersteer: interrupted", file=sys.stderr)
+        complain("interrupted")
         return INTERRUPTED
     return DONE if result["success"] else FAILED
 

@@ -116,14 +116,19 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) ->
     from countersteer.compiling import configure_jax
     from countersteer.tuning.compare import compare
     from countersteer.viewing.comparison import draw_comparison
+    from countersteer.writing import whole, write_whole
 
     configure_jax()
     horizon = None if options.horizon == "run" else read_horizon(options.horizon or "1.0")
     result, series = compare(run, car, horizon, options.dt)
     out = options.out or run.path
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "compare.json").write_text(json.dumps(result, indent=1) + "\n")
-    draw_comparison(series, out / "compare.png")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as reason:
+        raise InputError(f"--out {out}: cannot be made: {reason.strerror}") from None
+    with whole(out / "compare.json") as told:
+        write_whole(told, json.dumps(result, indent=1) + "\n")
+        draw_comparison(series, out / "compare.png")
     if options.json:
         print(json.dumps(result))
         return DONE

@@ -60,32 +60,34 @@ def run_turns(options: argparse.Namespace) -> int:
     from countersteer.drivers.policy import load_policy
     from countersteer.experiments import open_turns
     from countersteer.runs.recorder import new_folder
+    from countersteer.writing import whole, write_whole
 
     if options.runs:
         rows = [row for path in options.runs for row in open_turns.of_run(path)]
         tried, title = None, ", ".join(path.name for path in options.runs[:2])
         title += f" and {len(options.runs) - 2} more" if len(options.runs) > 2 else ""
-        folder = new_folder(options.out, "turns")
     else:
         configure_jax(cores=os.cpu_count() or 1)
         car, turning = load_car(options.car, options.set), load_policy(options.driver).turning
         cars = load_population(options.cars) if options.cars else None
         charge = options.battery or (None if cars else (0.3, 1.0))
         seeds = range(options.seed, options.seed + options.trials)
-        folder = new_folder(options.out, "turns")
-        with Progress(options.json) as progress:
-            rows = open_turns.trial(
-                car, turning, cars, seeds, options.speed_mps, charge, progress.show
-            )
         tried, title = options.trials, f"{options.car}, {options.trials} turns"
-    table = open_turns.as_table(rows)
-    open_turns.write_rows(folder / "turns.csv", rows)
-    open_turns.draw_turns(table, folder / "turns.png", title)
-    result: dict[str, Any] = (
-        {"car": options.car} if tried else {"runs": [str(path) for path in options.runs]}
-    )
-    result |= open_turns.summary(table, tried)
-    (folder / "turns.json").write_text(json.dumps(result, indent=1) + "\n")
+    with new_folder(options.out, "turns") as folder:
+        if not options.runs:
+            with Progress(options.json) as progress:
+                rows = open_turns.trial(
+                    car, turning, cars, seeds, options.speed_mps, charge, progress.show
+                )
+        table = open_turns.as_table(rows)
+        result: dict[str, Any] = (
+            {"car": options.car} if tried else {"runs": [str(path) for path in options.runs]}
+        )
+        result |= open_turns.summary(table, tried)
+        with whole(folder / "turns.json") as told, whole(folder / "turns.csv") as listed:
+            write_whole(told, json.dumps(result, indent=1) + "\n")
+            open_turns.write_rows(listed, rows)
+            open_turns.draw_turns(table, folder / "turns.png", title)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
         return DONE

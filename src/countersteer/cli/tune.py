@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from countersteer.cli.options import DONE, Verbs, number
+from countersteer.cli.options import DONE, Verbs, number, out_file
 from countersteer.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,17 +47,17 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`tune`."""
+    with out_file(options.out):
+        return fit(options)
+
+
+def fit(options: argparse.Namespace) -> int:
+    """A fit of any kind."""
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
     from countersteer.runs.run import read_run
     from countersteer.tuning.tune import other_floors
 
-    if options.out.suffix != ".toml":
-        raise InputError(f"--out {options.out}: name a .toml file")
-    try:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {options.out}: {error.strerror}") from None
     configure_jax(blocks=True)
     runs = [read_run(path) for path in options.runs]
     car, base = load_car(options.car), Path(options.car).stem
@@ -86,7 +86,8 @@ def tune_all(
 
     from countersteer.tuning import relearn, tune
     from countersteer.tuning.advice import next_log
-    from countersteer.viewing.tuning_page import write_tuning_page
+    from countersteer.viewing.tuning_page import tuning_page
+    from countersteer.writing import write_together
 
     with jax.enable_x64(True):
         cars = tune.by_surface(base, car, others)
@@ -111,12 +112,15 @@ def tune_all(
                 cars, result.cars, old, since, options.fit, hold_out, say
             )
         drawn = tune.series(result.cars, parts)
-    files = tune.write_cars(result, about, options.out)
     page = options.out.with_suffix(".html")
-    write_tuning_page(page, about, drawn)
     short = {key: value for key, value in about.items() if key != "residuals"}
+    files = tune.car_files(result, options.out)
     short["cars"] = {name: str(path) for name, path in files.items()}
-    options.out.with_suffix(".json").write_text(json.dumps(short, indent=1) + "\n")
+    told = {
+        page: tuning_page(about, drawn),
+        options.out.with_suffix(".json"): json.dumps(short, indent=1) + "\n",
+    }
+    write_together(tune.car_texts(result, about, options.out) | told)
     if options.json:
         print(json.dumps(short | {"page": str(page)}))
         return DONE
@@ -133,6 +137,7 @@ def tune_acceleration(options: argparse.Namespace, runs: list[Any], car: "Car") 
     from countersteer.car.files import save_car
     from countersteer.tuning.acceleration import fit_acceleration
     from countersteer.viewing.acceleration import draw_acceleration
+    from countersteer.writing import whole
 
     found = fit_acceleration(runs, car, options.source, options.precision)
     about: dict[str, Any] = {
@@ -147,9 +152,10 @@ def tune_acceleration(options: argparse.Namespace, runs: list[Any], car: "Car") 
         "not_used": {one.path.name: one.reason for one in found.unused},
         "masked": list(found.masked),
     }
-    save_car(found.car, options.out, {"acceleration": json.dumps(about)})
     picture = options.out.with_suffix(".png")
-    draw_acceleration(found, picture)
+    with whole(options.out) as fitted:
+        save_car(found.car, fitted, {"acceleration": json.dumps(about)})
+        draw_acceleration(found, picture)
     if options.json:
         print(json.dumps(about | {"car": str(options.out), "picture": str(picture)}))
         return DONE

@@ -29,6 +29,7 @@ from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
 from countersteer.text import read_toml, toml_of
+from countersteer.writing import write_whole
 
 LIBRARY = importlib.resources.files("countersteer.drivers") / "library"
 KIND = "drift-turn"
@@ -204,4 +205,4 @@ def save_policy(
     """Write a policy for a car. `source` says where its numbers are from."""
     whose = {} if car is None else {"car": car}
     tables = {"kind": KIND, **whose, **policy_tables(turning, stop_angle), "source": dict(source)}
-    path.write_text(toml_of(tables))
+    write_whole(path, toml_of(tables))

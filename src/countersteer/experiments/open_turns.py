@@ -18,10 +18,11 @@ from countersteer.car.car import Car
 from countersteer.drivers.open_turn import open_turn
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
-from countersteer.runs.files import Table, read_table
+from countersteer.runs.files import Table, csv_text, read_table
 from countersteer.runs.run import Run, drawn_car, read_run
 from countersteer.task.turns import sideslip
 from countersteer.tuning.windows import find_references, read_measured
+from countersteer.writing import whole, write_whole
 
 ON, OFF = 0.05, 0.02  # throttle that drives (above), and throttle that does not (up to)
 FAST = 1.0  # rad/s; above it, a car turns
@@ -225,15 +226,7 @@ def of_run(path: Path) -> list[list[Any]]:
 
 def write_rows(path: Path, rows: Sequence[Sequence[Any]]) -> None:
     """Write the rows as `turns.csv`. An unknown value is an empty cell."""
-    lines = [",".join(COLUMNS)]
-    lines += [",".join(_cell(value) for value in one) for one in rows]
-    path.write_text("\n".join(lines) + "\n")
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, str | int):
-        return str(value)
-    return "" if math.isnan(value) else f"{value:.6g}"
+    write_whole(path, csv_text(COLUMNS, rows))
 
 
 def as_table(rows: Sequence[Sequence[Any]]) -> Table:
@@ -300,7 +293,8 @@ def draw_turns(table: Table, path: Path, title: str) -> None:
     axes[0].legend(frameon=False, fontsize=8)
     figure.colorbar(dots, ax=axes, label="forward speed at the kill, m/s")
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    with whole(path) as part:
+        figure.savefig(part, format="png", dpi=110)
     plt.close(figure)
 
 

@@ -1,12 +1,14 @@
 """The result of an experiment, and its files."""
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from countersteer.runs.files import csv_text
+from countersteer.writing import whole, write_whole
 
 Report = Callable[[int, int], None]
 
@@ -32,23 +34,14 @@ def write(found: Result, folder: Path, name: str) -> dict[str, Any]:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    lines = [",".join(found.table)]
-    lines += [
-        ",".join(_cell(value) for value in row) for row in zip(*found.table.values(), strict=True)
-    ]
-    (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    result = {"experiment": name, **found.figures, "text": found.text}
+    rows = zip(*found.table.values(), strict=True)
     figure = plt.figure(figsize=found.size, layout="constrained")
     found.draw(figure)
-    figure.savefig(folder / f"{name}.png", dpi=110)
+    with whole(folder / "summary.json") as summary, whole(folder / f"{name}.png") as picture:
+        write_whole(folder / f"{name}.csv", csv_text(list(found.table), rows))
+        figure.savefig(picture, format="png", dpi=110)
+        text = json.dumps(result, indent=1, ensure_ascii=False) + "\n"
+        write_whole(summary, text)
     plt.close(figure)
-    result = {"experiment": name, **found.figures, "text": found.text}
-    (folder / "summary.json").write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     return result
-
-
-def _cell(value: Any) -> str:
-    """A number with six digits, an empty cell for NaN, or a word."""
-    if isinstance(value, str):
-        return value
-    number = float(value)
-    return "" if math.isnan(number) else f"{number:.6g}"

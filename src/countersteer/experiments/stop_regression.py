@@ -23,6 +23,7 @@ from countersteer.experiments.local_regression import (
     regress,
 )
 from countersteer.runs.files import Table
+from countersteer.writing import whole
 
 MOST = math.radians(30)  # largest angle to the stop for which the lines are straight
 
@@ -167,5 +168,6 @@ def draw(found: Stops, path: Path, title: str) -> None:
     figure = plt.figure(figsize=(10, 4), layout="constrained")
     paint(found, figure)
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    with whole(path) as part:
+        figure.savefig(part, format="png", dpi=110)
     plt.close(figure)

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from countersteer.errors import InputError
-from countersteer.runs.files import COMMANDS, TableWriter, command_rows
+from countersteer.runs.files import COMMANDS, command_rows, csv_text
+from countersteer.writing import write_whole
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # throttle: the paper's ten
 DURATION = 1.0  # s, the paper's
@@ -53,12 +54,11 @@ def throttle_steps(
     runs = []
     for level in levels:
         file = out / f"{step_name(level)}.csv"
-        writer = TableWriter(file, COMMANDS)
         throttle = np.where(np.arange(len(time)) < on, level, 0.0)
-        writer.write(command_rows(time, throttle, np.zeros(len(time))))
-        writer.close()
+        rows = command_rows(time, throttle, np.zeros(len(time)))
+        write_whole(file, csv_text(COMMANDS, rows))
         runs.append({"throttle": level, "commands": str(file)})
-    (out / "README.txt").write_text(_instructions(runs, on / rate))
+    write_whole(out / "README.txt", _instructions(runs, on / rate))
     return {"duration_s": on / rate, "rest_s": off / rate, "rate_hz": rate, "runs": runs}
 
 

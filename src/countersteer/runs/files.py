@@ -1,16 +1,18 @@
 """Tables in CSV files: columns as arrays, read strictly and written so that they round-trip."""
 
 import csv
+import io
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
 from countersteer.errors import InputError
 from countersteer.text import read_text
+from countersteer.writing import naming, write_whole
 
 log = logging.getLogger(__name__)
 
@@ -26,17 +28,20 @@ class Table(dict[str, np.ndarray]):
         return len(next(iter(self.values()))) if self.keys() else 0
 
 
-def read_table(path: Path, required: Iterable[str], text: Sequence[str] = ()) -> Table:
+def read_table(
+    path: Path, required: Iterable[str], text: Sequence[str] = (), recorded: bool = False
+) -> Table:
     """Read a CSV file with a header as columns of numbers; empty cells are NaN.
 
     Columns named in `text` stay text. A last line that was cut off, by a killed process, is left
-    out with a logged warning. Raises `InputError` if a column is missing or appears twice; and,
-    with the line, for a wrong number of cells, a cell that is no number, or a falling time.
+    out with a logged warning: one with too few cells, or, if `TableWriter` `recorded` the file, one
+    that does not end. Raises `InputError` if a column is missing or appears twice; and, with the
+    line, for a wrong number of cells, a cell that is no number, or a falling time.
     """
     content = read_text(path)
     lines = content.splitlines()
     whole = content.endswith("\n") or len(lines) < 2
-    if not whole and lines[-1].count(",") < lines[0].count(","):
+    if not whole and (recorded or lines[-1].count(",") < lines[0].count(",")):
         log.warning("%s: its last line, cut off in the middle, is passed over", path)
         lines = lines[:-1]
     rows = csv.reader(lines)
@@ -79,9 +84,12 @@ def _first(where: np.ndarray) -> int:
     return int(np.argmax(where)) + 2
 
 
-def read_commands(path: Path) -> Table:
-    """Read a `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad)."""
-    table = read_table(path, COMMANDS, text=("direction",))
+def read_commands(path: Path, recorded: bool = False) -> Table:
+    """Read a `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad).
+
+    `recorded` is as in `read_table`.
+    """
+    table = read_table(path, COMMANDS, text=("direction",), recorded=recorded)
     for name in table:
         if name not in COMMANDS:
             raise InputError(f"{path}: unknown column {name}; known: {', '.join(COMMANDS)}")
@@ -137,22 +145,36 @@ class TableWriter:
 
     def write(self, rows: Iterable[Sequence[str]]) -> None:
         """Append rows and pass them to the operating system."""
-        try:
+        with naming(self._path):
             self._file.write("".join(",".join(row) + "\n" for row in rows))
             self._file.flush()
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self._path)) from None
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        with naming(self._path):
+            self._file.close()
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Write a whole table at once."""
-    writer = TableWriter(path, list(columns))
-    writer.write(column_rows(columns.values()))
-    writer.close()
+    write_whole(path, csv_text(list(columns), column_rows(columns.values())))
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]], digits: int = 6) -> str:
+    """The text of a CSV file. Words and whole numbers stay as they are, NaN is an empty cell."""
+
+    def cell(value: Any) -> str:
+        if isinstance(value, str):
+            return value
+        if isinstance(value, int | np.integer):
+            return str(int(value))
+        return "" if math.isnan(value) else f"{float(value):.{digits}g}"
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows([cell(value) for value in row] for row in rows)
+    return text.getvalue()
 
 
 def require(place: Callable[[int], str], good: np.ndarray, message: str) -> None:

@@ -114,7 +114,7 @@ class McapWriter:
 
     def _check(self) -> None:
         if (error := self._file.error) is not None:
-            raise OSError(error.errno, error.strerror, str(self._path)) from error
+            raise OSError(error.errno, error.strerror, str(self._path)) from None
 
 
 class _File:

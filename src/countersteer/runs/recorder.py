@@ -1,9 +1,11 @@
 """Writes a run's folder during the drive, which is simulated, imported or real."""
 
+import contextlib
 import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -15,6 +17,18 @@ from countersteer.runs.files import COMMANDS, TableWriter, column_rows, command_
 from countersteer.runs.mcap import McapWriter
 from countersteer.signals import TRUTH, Command, Readings, flat, pairs
 from countersteer.text import toml_of
+from countersteer.writing import (
+    BusyError,
+    alone,
+    is_empty,
+    naming,
+    new_part,
+    remove,
+    write_whole,
+)
+
+# The files by which a folder is known as a result of this program.
+RESULTS = ("run.toml", "evaluate.json", "turns.json", "summary.json")
 
 
 class Pace(NamedTuple):
@@ -39,38 +53,101 @@ class Frames(NamedTuple):
     truth: tuple[np.ndarray, ...] | None = None  # values of `TRUTH`; None: unknown
 
 
-def new_folder(out: Path | None, name: str) -> Path:
-    """Make an empty folder for a run: `out`, or else a numbered one under `runs/`.
+@contextlib.contextmanager
+def new_folder(out: Path | None, name: str) -> Iterator[Path]:
+    """Make an empty folder for results: `out`, or else a numbered one under `runs/`.
 
-    An existing run is kept under another name, with the next free number. Raises `InputError` if
-    the folder holds something other than a run, or if it cannot be made.
+    No other process of this program writes there until the block ends. An existing result is kept
+    under another name, with the next free number. If the block raises an exception and nothing was
+    written, the folder goes away. Raises `InputError` if another process writes there, if the
+    folder holds something other than a result, or if it cannot be made.
     """
-    if out is None:
-        return _numbered(Path("runs"), name)
+    with contextlib.ExitStack() as stack:
+        folder = _numbered(Path("runs"), name, stack) if out is None else _made(out, stack)
+        try:
+            yield folder
+        except BaseException:
+            with contextlib.suppress(OSError):  # it is not empty
+                folder.rmdir()
+            raise
+
+
+@contextlib.contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """As `new_folder`, for a run that is written at once: the folder appears when the block ends.
+
+    Give the path of a part, to write the files to. If the block raises an exception, `out` stays
+    as it was. An `OSError` names `out`.
+    """
+    with contextlib.ExitStack() as stack:
+        _reserve(out, stack)
+        with naming(out):
+            part = new_part(Path(os.path.abspath(out)))
+            part.mkdir()
+            try:
+                yield part
+                _move_aside(out)
+                if out.exists():
+                    remove(out)  # it is empty
+                part.rename(out)
+            finally:
+                remove(part)
+
+
+def _made(out: Path, stack: contextlib.ExitStack) -> Path:
+    """Make the folder `out`, which other processes leave alone until the stack is closed."""
+    _reserve(out, stack)
     try:
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            if not (out / "run.toml").exists():
-                raise InputError(f"{out}: is there already and is not a run: give another --out")
-            others = (out.with_name(f"{out.name}.{number}") for number in itertools.count(1))
-            out.rename(next(path for path in others if not path.exists()))
-        out.mkdir(parents=True, exist_ok=True)
+        _move_aside(out)
+        out.mkdir(exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be made: {error.strerror}") from None
     return out
 
 
-def _numbered(parent: Path, name: str) -> Path:
+def _reserve(out: Path, stack: contextlib.ExitStack) -> None:
+    """Keep other processes from `out`. Raises `InputError` if no result may be made there."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        stack.enter_context(alone(out))
+        if not out.exists() or (out.is_dir() and is_empty(out)):
+            return
+        results = any((out / name).exists() for name in RESULTS)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made: {error.strerror}") from None
+    if not results:
+        raise InputError(f"{out}: is there already and is not a run: give another --out")
+    if out.name in ("", ".."):
+        raise InputError(f"{out}: holds a run: give another --out")
+
+
+def _move_aside(out: Path) -> None:
+    """Give an existing result the next free number. The caller has reserved `out`."""
+    if not out.exists() or is_empty(out):
+        return
+    for number in itertools.count(1):
+        other = out.with_name(f"{out.name}.{number}")
+        # Another process may be about to write to that name.
+        with contextlib.suppress(BusyError), alone(other):
+            if not other.exists():
+                out.rename(other)
+                return
+
+
+def _numbered(parent: Path, name: str, stack: contextlib.ExitStack) -> Path:
     """Make the folder with the first free number. Simultaneous drives get different folders."""
-    number = 1
-    while True:
+    for number in itertools.count(1):
         folder = parent / f"{name}-{number:03d}"
         try:
             folder.mkdir(parents=True)
-            return folder
         except FileExistsError:
-            number += 1
+            continue
         except OSError as error:
             raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+        with contextlib.suppress(BusyError):  # who was given its name may have been faster
+            stack.enter_context(alone(folder))
+            return folder
+    raise AssertionError("numbers have no end")
 
 
 def _due(tick: np.ndarray, before: np.ndarray, every: int) -> np.ndarray:
@@ -107,7 +184,7 @@ class Recorder:
             headers = {"commands": COMMANDS, "telemetry": ("time_s", *told), "truth": truth}
         assert headers is not None
         text = toml_of(about)
-        (folder / "run.toml").write_text(text)
+        write_whole(folder / "run.toml", text)
         self._tables = {
             name: TableWriter(folder / f"{name}.csv", header) for name, header in headers.items()
         }
@@ -166,7 +243,7 @@ class Recorder:
     def finish(self, summary: dict[str, Any]) -> None:
         """Write `summary.json`."""
         self._summary = summary
-        (self.folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+        write_whole(self.folder / "summary.json", json.dumps(summary, indent=1) + "\n")
 
     def __enter__(self) -> Self:
         return self

@@ -35,6 +35,12 @@ class Run:
         )
 
     @property
+    def outcome(self) -> str:
+        """How the drive ended, in words. A drive whose process was killed is "not finished"."""
+        unknown = "not finished" if "pilot" in self.about else "not judged"
+        return str(self.summary.get("outcome", unknown))
+
+    @property
     def walls(self) -> np.ndarray:
         """Ends (x, y, x, y) of the course's walls (m): (n, 4)."""
         walls = self.about.get("course", {}).get("walls_m", [])
@@ -71,12 +77,15 @@ def read_run(path: Path) -> Run:
     if not (path / "run.toml").exists():
         raise InputError(f"{path}: not a run: it has no run.toml")
     about = tables_of(read_text(path / "run.toml"), f"{path}/run.toml")
+    recorded = (path / "run.mcap").exists()  # no table that was written by hand
     telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
     return Run(
         path,
         about,
-        read_commands(path / "commands.csv"),
-        read_table(telemetry, ("time_s",)) if telemetry.exists() else None,
-        read_table(truth, ("time_s", "x_m", "y_m", "heading_rad")) if truth.exists() else None,
+        read_commands(path / "commands.csv", recorded),
+        read_table(telemetry, ("time_s",), recorded=recorded) if telemetry.exists() else None,
+        read_table(truth, ("time_s", "x_m", "y_m", "heading_rad"), recorded=recorded)
+        if truth.exists()
+        else None,
         read_summary(summary) if summary.exists() else {},
     )

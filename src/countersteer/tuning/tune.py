@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from countersteer.car.car import Car
-from countersteer.car.files import library, load_car, save_car
+from countersteer.car.files import car_text, library, load_car
 from countersteer.car.parameter import EDGE, changed
 from countersteer.errors import InputError
 from countersteer.runs.defects import LogDefect, find_defects, refuse, repair
@@ -283,16 +283,20 @@ def residuals(cars: dict[str, Car], logs: Logs, most: int = 3000) -> dict[str, A
     return result
 
 
-def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Path]:
-    """Write the cars as files: the first in full, the others beside it with `FLOOR` alone.
+def car_files(result: Result, out: Path) -> dict[str, Path]:
+    """The file of each car: the first car's is `out`, those of the others are beside it."""
+    first, *others = result.cars
+    return {first: out} | {name: out.with_name(f"{name}.toml") for name in others}
 
-    Returns the files by car.
-    """
-    names = list(result.cars)
-    files = {names[0]: out} | {name: out.with_name(f"{name}.toml") for name in names[1:]}
-    source = {"fit": f"countersteer tune --fit {about['fit']} --car {about.get('car', names[0])}"}
+
+def car_texts(result: Result, about: dict[str, Any], out: Path) -> dict[Path, str]:
+    """The texts of `car_files`: the first car in full, the others with `FLOOR` alone."""
+    files = car_files(result, out)
+    base = about.get("car", next(iter(files)))
+    source = {"fit": f"countersteer tune --fit {about['fit']} --car {base}"}
     runs = sorted({run["run"] for run in about["runs"] if run["kind"] != "validation"})
     source["logs"] = ", ".join(runs)
+    texts = {}
     for name, path in files.items():
         about_source = source | {
             kind.replace(" ", "_"): _errors(totals[name])
@@ -303,8 +307,8 @@ def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Pa
             about_source["not_determined"] = (
                 ", ".join(about["not_determined"]) + ": left as they were"
             )
-        if name == names[0]:
-            save_car(result.cars[name], path, about_source)
+        if path == out:
+            texts[path] = car_text(result.cars[name], about_source)
             continue
         tables: dict[str, Any] = {"base": out.name, "source": about_source}
         for path_inside in FLOOR:
@@ -314,8 +318,8 @@ def write_cars(result: Result, about: dict[str, Any], out: Path) -> dict[str, Pa
             for room in rooms:
                 table = table.setdefault(room, {})
             table[key + suffix] = fit.value_of(result.cars[name], path_inside) / factor
-        path.write_text(toml_of(tables))
-    return files
+        texts[path] = toml_of(tables)
+    return texts
 
 
 def _errors(total: dict[str, Any]) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from countersteer.tuning.acceleration import DURATION, Acceleration
 from countersteer.viewing.style import INK, MEASURED, SIMULATED, SOFT, STEERED, dress, new_figure
+from countersteer.writing import whole
 
 _COLUMNS, _PANEL_IN = 5, (2.8, 2.75)
 
@@ -79,4 +80,5 @@ def draw_acceleration(found: Acceleration, path: Path) -> None:
         fontsize=10.5,
         labelcolor=SOFT,
     )
-    canvas.print_png(str(path))
+    with whole(path) as part:
+        canvas.print_png(str(part))

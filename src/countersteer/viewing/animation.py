@@ -1,7 +1,6 @@
 """A run seen from above as an animation, GIF or MP4."""
 
 import math
-import os
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -16,6 +15,7 @@ from countersteer.errors import InputError
 from countersteer.runs.run import Run, drawn_car
 from countersteer.viewing import picture
 from countersteer.viewing.style import INK, LINE, PAPER, SOFT
+from countersteer.writing import whole
 
 Array = NDArray[np.float64]
 
@@ -356,14 +356,8 @@ def export(animation: Animation, path: Path, kind: str, told: Told) -> None:
     The file appears under its name when it is complete. Raises `InputError` if the library for MP4
     is missing, `OSError` if the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole(path) as part:
         (write_gif if kind == "gif" else write_mp4)(animation, part, told)
-        part.replace(path)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def write_gif(animation: Animation, path: Path, told: Told) -> None:

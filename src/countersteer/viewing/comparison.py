@@ -20,6 +20,7 @@ from countersteer.viewing.style import (
     dress,
     new_figure,
 )
+from countersteer.writing import whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +63,8 @@ def draw_comparison(series: Mapping[str, Any], path: Path) -> None:
         draw_windows(axes, signal.time, signal.value, _predictions(series, name, shown))
         title, unit = _NAMES[name]
         _write_caption(figure, bottom + pitch, f"{title}, {unit}", _errors(result, name, unit))
-    canvas.print_png(str(path))
+    with whole(path) as part:
+        canvas.print_png(str(part))
 
 
 def _apart(starts: list[float], least: float) -> list[int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from countersteer.task.judge import DRIFT, Outcome, Score
+from countersteer.writing import whole
 
 
 def draw_evaluation(scores: Mapping[str, Score], title: str, path: Path) -> None:
@@ -45,5 +46,6 @@ def draw_evaluation(scores: Mapping[str, Score], title: str, path: Path) -> None
     if errors.get_legend_handles_labels()[0]:
         errors.legend(frameon=False, fontsize=8)
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    with whole(path) as part:
+        figure.savefig(part, format="png", dpi=110)
     plt.close(figure)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from countersteer.viewing.style import DPI, INK, LINE, PAPER, SOFT, new_figure
+from countersteer.writing import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,10 +70,14 @@ _LONG = 2.0
 
 
 def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
-    """Write the drive `view` (one sample or more) to `path` as PNG, from above and over time.
+    """Write the PNG of `picture_png` to `path`. An existing file is replaced."""
+    write_whole(path, picture_png(view))
+
+
+def picture_png(view: dict[str, Any]) -> bytes:
+    """The drive `view` (one sample or more) as PNG, from above and over time.
 
     The car stands on its path at regular intervals, denser in turns, coloured by its sideslip.
-    An existing file is replaced.
     """
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -87,7 +92,9 @@ def draw_picture(view: dict[str, Any], path: pathlib.Path) -> None:
     metres_per_width = _draw_floor(figure, layout.floor, view, colours, colours_end)
     _draw_keys(figure, layout.floor, colours, colours_end, metres_per_width)
     _draw_strips(figure, layout.strips, view)
-    canvas.print_png(str(path), pil_kwargs={"compress_level": 1})
+    png = io.BytesIO()
+    canvas.print_png(png, pil_kwargs={"compress_level": 1})
+    return png.getvalue()
 
 
 def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
@@ -111,11 +118,12 @@ def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: fl
         mood = INK
     figure.text(0.022, 0.914, verdict, color=mood, size=13, weight="bold", va="center")
     lap_time, times = summary.get("lap_time_s"), view["time_s"]
+    contacts = summary["wall_contacts"]
     facts = (
         ("drive time", f"{times[-1] - times[0]:.2f} s")
         if lap_time is None
         else ("lap time", f"{lap_time:.2f} s"),
-        ("wall contacts", f"{summary['wall_contacts']}"),
+        ("wall contacts", "–" if contacts is None else f"{contacts}"),
         ("largest sideslip", f"{largest_sideslip:.0f}°"),
     )
     for right, (name, value) in zip((0.718, 0.845, 0.978), facts, strict=True):
@@ -440,40 +448,40 @@ def _ticks(low: float, high: float, least_step: float) -> list[float]:
 class Painter:
     """A process that prepares to draw while the drive is still computed.
 
-    Importing Matplotlib takes as long as a short drive. If this program ends early, the process
-    also ends, and draws nothing.
+    Importing Matplotlib takes as long as a short drive. The process writes no file: if this program
+    ends early, nothing is left that could write to a run's folder.
     """
 
-    def __init__(self, path: pathlib.Path) -> None:
-        """Start the process. It will draw to `path`."""
+    def __init__(self) -> None:
+        """Start the process."""
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "countersteer.viewing.picture", str(path)],
+            [sys.executable, "-m", "countersteer.viewing.picture"],
             stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
             start_new_session=True,  # Ctrl-C stops the drive only
         )
 
     def draw(self, view: dict[str, Any]) -> None:
-        """Begins `draw_picture`, over there."""
-        assert self._process.stdin is not None
-        self._view = json.dumps(view)
+        """Begins `picture_png`, over there."""
+        self._view = json.dumps(view).encode()
         self._thread = threading.Thread(target=self._send)
         self._thread.start()
 
     def _send(self) -> None:
-        self._answer = self._process.communicate(self._view)
+        self._png, self._errors = self._process.communicate(self._view)
 
     def cancel(self) -> None:
         """Nothing is drawn."""
-        self._process.communicate("")
+        self._process.communicate(b"")
 
-    def finish(self) -> None:
-        """Waits until it is drawn. Raises `OSError` with the reason if it failed."""
+    def finish(self, path: pathlib.Path) -> None:
+        """Waits until it is drawn, and writes it. Raises `OSError` with the reason if it failed."""
         self._thread.join()
         if self._process.returncode:
-            words = self._answer[1].strip().splitlines()[-1]
-            raise OSError(f"the picture was not drawn: {words}")
+            words = self._errors.decode(errors="replace").strip().splitlines() or ["it was ended"]
+            raise OSError(f"the picture was not drawn: {words[-1]}")
+        write_whole(path, self._png)
 
 
 if __name__ == "__main__":
@@ -483,7 +491,8 @@ if __name__ == "__main__":
     canvas.print_png(io.BytesIO())
     gc.freeze()
     gc.disable()  # a tenth of a drawing would go into looking for garbage
-    text = sys.stdin.read()
+    text = sys.stdin.buffer.read()
     if text:
-        draw_picture(json.loads(text), pathlib.Path(sys.argv[1]))
+        sys.stdout.buffer.write(picture_png(json.loads(text)))
+        sys.stdout.flush()
     os._exit(0)  # as `cli.entry`

@@ -26,6 +26,7 @@ from countersteer.viewing.style import (
     dress,
     new_figure,
 )
+from countersteer.writing import write_whole
 
 if TYPE_CHECKING:
     pass
@@ -61,7 +62,12 @@ _LIMIT, _BINS = 4.0, 32  # of histograms: range to either side, in scales, and n
 def write_tuning_page(
     path: Path, result: Mapping[str, Any], series: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Write the page of a tuning to `path`. It loads no other file. An existing file is replaced.
+    """Write the page of `tuning_page` to `path`. An existing file is replaced."""
+    write_whole(path, tuning_page(result, series))
+
+
+def tuning_page(result: Mapping[str, Any], series: Sequence[Mapping[str, Any]]) -> str:
+    """The page of a tuning. It loads no other file.
 
     `result` is the JSON of `countersteer tune`. `low` and `high` of a parameter, if given, are its
     likely range before the fit. Otherwise the range is a factor of e around a positive prior, and
@@ -86,7 +92,7 @@ def write_tuning_page(
         "runs": "".join(_run(run, result["runs"]) for run in series),
         "commands": escape(result["commands"]),
     }
-    path.write_text(filled("tuning_page_template.html", fields), encoding="utf-8")
+    return filled("tuning_page_template.html", fields)
 
 
 # -------------------------------------------------------------------------------------------------

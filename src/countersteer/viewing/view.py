@@ -1,5 +1,6 @@
 """The data for a run's report and picture, from the run's own files."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from countersteer.car.car import GRAVITY, Car, wheel_positions
 from countersteer.errors import InputError
 from countersteer.kept_programs import kept
+from countersteer.runs.files import Table
 from countersteer.runs.run import Run, drawn_car
 from countersteer.signals import Array, Motion, Wheels
 from countersteer.task.turns import sideslip
@@ -18,7 +20,7 @@ from countersteer.world.floor import Floor, floor_of_run
 
 PERIOD = 0.01  # s between two samples, at least
 ROWS = 1024  # in each computation of forces; a fixed number, so that there is one program
-UNJUDGED = {"outcome": "not judged", "completed": False, "wall_contacts": 0, "turns": []}
+UNJUDGED: dict[str, Any] = {"completed": False, "wall_contacts": None, "turns": []}
 WHEELS = ("fl", "fr", "rl", "rr")
 MOTION = ("vx_mps", "vy_mps", "yaw_rate_radps", "steering_rad")
 
@@ -26,14 +28,21 @@ MOTION = ("vx_mps", "vy_mps", "yaw_rate_radps", "steering_rad")
 def view_of(run: Run) -> dict[str, Any]:
     """The view of a run: plain lists, with units in the names.
 
-    Raises `InputError` if the run has no `truth.csv`, or one without a simulated car's columns.
+    Rows that do not say all of the motion are left out. Raises `InputError` if the run has no
+    `truth.csv`, or one without a simulated car's columns.
     """
     if run.truth is None or len(run.truth) == 0:
         raise InputError(f"{run.path}: has no truth.csv to draw")
-    for name in (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS)):
+    needed = (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS))
+    for name in needed:
         if name not in run.truth:
             raise InputError(f"{run.path}/truth.csv: has no {name}: this page is of simulated runs")
-    truth, about, car = run.truth, run.about, drawn_car(run.about)
+    shown_columns = ("x_m", "y_m", "heading_rad", *needed)
+    known = np.all(np.isfinite([run.truth[name] for name in shown_columns]), axis=0)
+    if not known.any():
+        raise InputError(f"{run.path}/truth.csv: has no row that says all of the motion")
+    truth = Table({name: column[known] for name, column in run.truth.items()})
+    run, about, car = dataclasses.replace(run, truth=truth), run.about, drawn_car(run.about)
     time = truth["time_s"]
     period = float(np.median(np.diff(time))) if len(time) > 1 else PERIOD
     every = slice(None, None, max(1, round(PERIOD / max(period, 1e-6))))
@@ -52,7 +61,7 @@ def view_of(run: Run) -> dict[str, Any]:
     return {
         "title": f"{place}, {about.get('driver')}, {about.get('car_name')}, "
         f"seed {about.get('seed')}",
-        "summary": UNJUDGED | run.summary,
+        "summary": UNJUDGED | {"outcome": run.outcome} | _unfinished(run, time) | run.summary,
         "walls_m": about.get("course", {}).get("walls_m", []),
         "car": {
             "length_m": float(body.length),
@@ -71,6 +80,12 @@ def view_of(run: Run) -> dict[str, Any]:
         "sonar": echoes(run, car) if place != "open floor" else [],
         "wheels": wheel_views(car, motions(run, car), floor_of_run(about), every),
     } | {name: values[every].tolist() for name, values in shown.items()}
+
+
+def _unfinished(run: Run, time: np.ndarray) -> dict[str, str]:
+    """The verdict on a drive that was recorded up to a time (s) and has no summary."""
+    verdict = f"{run.outcome}: the record ends at {time[-1]:.2f} s"
+    return {"verdict": verdict} if run.outcome == "not finished" else {}
 
 
 def warm_up(car: Car, floor: Floor | None = None) -> None:

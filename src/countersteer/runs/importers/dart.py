@@ -25,7 +25,7 @@ from countersteer.runs.files import (
     read_table,
     require,
 )
-from countersteer.runs.recorder import Recorder, new_folder
+from countersteer.runs.recorder import Recorder, whole_folder
 
 FULL_LOCK = 25.0  # degrees, nominal angle of the front wheels at a steering of 1
 
@@ -132,7 +132,6 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
             if CLOCK in table
             else "at the centre of mass in the file itself"
         )
-    folder = new_folder(out / log.stem, log.stem)
     steering = np.radians(FULL_LOCK * updates["steering"])
     headers = {"commands": COMMANDS, "telemetry": tuple(telemetry)}
     tables = {
@@ -142,7 +141,8 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
     if found.truth is not None:
         headers["truth"] = tuple(found.truth)
         tables["truth"] = tuple(found.truth.values())
-    with Recorder(folder, about, headers) as recorder:
+    folder = out / log.stem
+    with whole_folder(folder) as part, Recorder(part, about, headers) as recorder:
         recorder.write(tables)
     return {"run": str(folder), "duration_s": float(updates["time_s"][-1]), **about}
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from countersteer.errors import InputError
 from countersteer.runs.files import COMMANDS, require
-from countersteer.runs.recorder import Recorder, new_folder
+from countersteer.runs.recorder import Recorder, whole_folder
 
 FULL_LOCK = 36.0  # degrees, nominal angle of the front wheels at a steering of 1
 
@@ -84,13 +84,16 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
             "commands_not_in_buffer": int(np.sum(np.abs(newest) > 1e-6)),
         },
     }
-    folder = new_folder(out / log.stem, log.stem)
     truth = {name: column[~repeated] for name, column in truth.items()}
     tables = {
         "commands": (time, throttle, np.radians(FULL_LOCK * steering)),
         "truth": tuple(truth.values()),
     }
-    with Recorder(folder, about, {"commands": COMMANDS, "truth": tuple(truth)}) as recorder:
+    folder = out / log.stem
+    with (
+        whole_folder(folder) as part,
+        Recorder(part, about, {"commands": COMMANDS, "truth": tuple(truth)}) as recorder,
+    ):
         recorder.write(tables)
     return {"run": str(folder), "duration_s": float(time[-1]), **about}
 
