@@ -32,6 +32,7 @@ from countersteer.cli.options import (
     Parser,
     Progress,
     Verbs,
+    one_line,
 )
 from countersteer.errors import InputError
 from countersteer.progress import waiting
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with waiting(_title(options), cache_folder() / "waits.json"):
             return int(options.run(options))
     except InputError as error:
-        print(f"countersteer: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"countersteer: {one_line(error)}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
         print("countersteer: interrupted", file=sys.stderr)

@@ -36,11 +36,12 @@ def run(options: argparse.Namespace) -> int:
     module, car = experiments.load(options.name), load_car(options.car, options.set)
     if options.runs and not hasattr(module, "measure"):
         raise InputError(f"--from: {options.name} is simulated, and measures no run")
-    folder = new_folder(options.out, options.name)
-    with Progress(options.json) as progress:
-        if options.runs:
-            found = module.measure([read_run(path) for path in options.runs])
-        else:
+    if options.runs:  # a run that cannot be measured leaves no folder
+        found = module.measure([read_run(path) for path in options.runs])
+        folder = new_folder(options.out, options.name)
+    else:
+        folder = new_folder(options.out, options.name)
+        with Progress(options.json) as progress:
             found = module.simulate(car, Path(options.car).stem, progress.show)
     result = write(found, folder, options.name)
     if options.json:

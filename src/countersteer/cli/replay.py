@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from countersteer.cli.options import DONE, Verbs, number, physics
 from countersteer.cli.recorded import record, set_up
 from countersteer.errors import InputError
+from countersteer.reading.values import shown
 
 if TYPE_CHECKING:
     from countersteer.car.car import Car
 
 
-LONGEST_REPLAY = 3600.0  # s
 INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
 
 
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.estimation.dead_reckoning import DeadReckoning
     from countersteer.pilot import Pilot
     from countersteer.recorded_drive import Drive, about_run
-    from countersteer.runs.files import read_commands
+    from countersteer.runs.files import LONGEST, read_commands
     from countersteer.runs.run import read_run
     from countersteer.simulator import Simulator
     from countersteer.world.floor import floor_of_run
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
         floor=floor_of_run(run.about) if run else None,
     )
     times = commands["time_s"]
-    if times[-1] > LONGEST_REPLAY:
+    if times[-1] > LONGEST:
         raise InputError(f"{options.source}: commands go on to {times[-1]:g} s, over an hour")
     last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
     longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
@@ -150,7 +150,7 @@ def read_initial(text: str) -> tuple[tuple[float, float, float], tuple[float, fl
         try:
             values[name] = float(value)
         except ValueError:
-            raise InputError(f"--initial: {name} must be a number, not {value!r}") from None
+            raise InputError(f"--initial: {name} must be a number, not {shown(value)}") from None
         if not abs(values[name]) <= 1000:
             raise InputError(f"--initial: {name} must be in [-1000, 1000]")
     x, y, heading, vx, vy, yaw_rate = values.values()

@@ -277,6 +277,8 @@ def draw_turns(table: Table, path: Path, title: str) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    speeds = table["kill_speed_mps"]
+    slowest, fastest = (float(np.min(speeds)), float(np.max(speeds))) if len(speeds) else (0.0, 1.0)
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharex=True)
     for ax, name, label in (
         (axes[0], "time_to_stop_s", "time to stop, s"),
@@ -288,8 +290,8 @@ def draw_turns(table: Table, path: Path, title: str) -> None:
                 table["kill_yaw_rate_degps"][mine],
                 table[name][mine],
                 c=table["kill_speed_mps"][mine],
-                vmin=float(np.min(table["kill_speed_mps"], initial=9.0)),
-                vmax=float(np.max(table["kill_speed_mps"], initial=0.0)),
+                vmin=slowest,
+                vmax=fastest,
                 s=14,
                 marker=marker,
                 linewidths=0,

@@ -16,7 +16,7 @@ from scipy.ndimage import median_filter
 from countersteer.car.car import GRAVITY
 from countersteer.errors import InputError
 from countersteer.runs.files import Table
-from countersteer.runs.run import Run
+from countersteer.runs.run import Run, refuse_long
 
 # Clocks
 MISSED = 5.0  # periods between two rows that make a gap; every log has one or two late rows
@@ -491,6 +491,7 @@ def stuck_gyroscope(run: Run, track: Track | None) -> Iterator[LogDefect]:
 
 def refuse(run: Run) -> None:
     """Raise `InputError` with file and time for errors that masking a stretch cannot remove."""
+    refuse_long(run)
     for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
         if table is not None:
             _refuse_table(f"{run.path}/{name}.csv", table)

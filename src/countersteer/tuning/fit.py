@@ -692,10 +692,13 @@ def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarr
     """Half the difference between fits to two halves of the data: (parameters,).
 
     Windows in the order of their logs are cut into eighths. The even eighths are one half, the odd
-    ones the other. The result is 0 for a parameter whose surface or log is in one half only.
+    ones the other. Fewer than eight windows go to the halves by turns. The result is 0 for a
+    parameter whose surface or log is in one half only, and for all with a single window.
     """
     rank = np.argsort(np.argsort(whole.shots.run, kind="stable"))
-    eighth = rank * 8 // len(rank)
+    if len(rank) < 2:
+        return np.zeros(len(u))
+    eighth = rank * 8 // len(rank) if len(rank) >= 8 else rank
     ends, in_both = np.tile(u, (2, 1)), np.full(len(u), True)
     for half, end in enumerate(ends):
         problem = Problem(

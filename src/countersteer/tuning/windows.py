@@ -15,9 +15,10 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from countersteer.car.car import Car
+from countersteer.errors import InputError
 from countersteer.runs.defects import stretches
 from countersteer.runs.files import Table
-from countersteer.runs.run import Run
+from countersteer.runs.run import Run, refuse_long
 from countersteer.signals import Command, Motion, Scalar, Wheels
 from countersteer.world import motor, planar, servo
 from countersteer.world.chassis import Vector, dot
@@ -29,6 +30,7 @@ EVERY = 0.25  # s between the starts of windows
 SLOWEST = 0.2  # m/s, least speed at the start of a window
 
 SMOOTHED_OVER, DEGREE = 0.15, 3  # s, width of the Savitzky-Golay filter, and its degree
+MOST_POSES = 10_000_000  # after resampling
 GAP = 0.035  # s; longer gaps of motion capture are not interpolated
 
 PIECE = 100  # ticks in each call of the compiled program, for any horizon
@@ -97,7 +99,11 @@ class Reference(NamedTuple):
 
 
 def read_measured(run: Run, car: Car) -> Measured:
-    """Body velocities, wheel speeds and sensor readings of a run."""
+    """Body velocities, wheel speeds and sensor readings of a run.
+
+    Raises `InputError` if the run is too long, or its poses are too close in time.
+    """
+    refuse_long(run)
     vx = vy = yaw_rate = wheels = None
     truth = run.truth
     if truth is not None and len(truth):
@@ -179,6 +185,8 @@ def velocities(
     if len(time) < 2 or not np.median(np.diff(time)) > 0:
         return none, none, none
     step = float(np.median(np.diff(time)))
+    if (time[-1] - time[0]) / step > MOST_POSES:
+        raise InputError(f"truth.csv: poses are {step:g} s apart: that is no rate of measurement")
     grid = np.arange(time[0], time[-1] + step / 2, step)
     after = np.clip(np.searchsorted(time, grid, side="right"), 1, len(time) - 1)
     known = time[after] - time[after - 1] <= max(GAP, 1.5 * step)

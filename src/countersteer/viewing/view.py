@@ -1,5 +1,6 @@
 """The data for a run's report and picture, from the run's own files."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from countersteer.car.car import GRAVITY, Car, wheel_positions
 from countersteer.errors import InputError
 from countersteer.kept_programs import kept
+from countersteer.runs.files import Table
 from countersteer.runs.run import Run, drawn_car
 from countersteer.signals import Array, Motion, Wheels
 from countersteer.task.turns import sideslip
@@ -17,10 +19,12 @@ from countersteer.world import planar
 from countersteer.world.floor import Floor, floor_of_run
 
 PERIOD = 0.01  # s between two samples, at least
+LARGEST = 1e6  # of a number in truth.csv that is drawn
 ROWS = 1024  # in each computation of forces; a fixed number, so that there is one program
 UNJUDGED = {"outcome": "not judged", "completed": False, "wall_contacts": 0, "turns": []}
 WHEELS = ("fl", "fr", "rl", "rr")
 MOTION = ("vx_mps", "vy_mps", "yaw_rate_radps", "steering_rad")
+COLUMNS = (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS))
 
 
 def view_of(run: Run) -> dict[str, Any]:
@@ -30,10 +34,13 @@ def view_of(run: Run) -> dict[str, Any]:
     """
     if run.truth is None or len(run.truth) == 0:
         raise InputError(f"{run.path}: has no truth.csv to draw")
-    for name in (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS)):
+    for name in COLUMNS:
         if name not in run.truth:
             raise InputError(f"{run.path}/truth.csv: has no {name}: this page is of simulated runs")
-    truth, about, car = run.truth, run.about, drawn_car(run.about)
+    about, car = run.about, drawn_car(run.about)
+    run = dataclasses.replace(run, truth=known_rows(run))
+    truth = run.truth
+    assert truth is not None
     time = truth["time_s"]
     period = float(np.median(np.diff(time))) if len(time) > 1 else PERIOD
     every = slice(None, None, max(1, round(PERIOD / max(period, 1e-6))))
@@ -71,6 +78,16 @@ def view_of(run: Run) -> dict[str, Any]:
         "sonar": echoes(run, car) if place != "open floor" else [],
         "wheels": wheel_views(car, motions(run, car), floor_of_run(about), every),
     } | {name: values[every].tolist() for name, values in shown.items()}
+
+
+def known_rows(run: Run) -> Table:
+    """The rows of `truth.csv` whose numbers can all be drawn. Raises `InputError` without one."""
+    assert run.truth is not None
+    drawn = [run.truth[name] for name in ("time_s", "x_m", "y_m", "heading_rad", *COLUMNS)]
+    known = np.all(np.abs(drawn) <= LARGEST, axis=0)  # false for NaN too
+    if not np.any(known):
+        raise InputError(f"{run.path}/truth.csv: holds no row of numbers that can be drawn")
+    return Table({name: column[known] for name, column in run.truth.items()})
 
 
 def warm_up(car: Car, floor: Floor | None = None) -> None:
