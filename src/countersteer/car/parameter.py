@@ -112,10 +112,11 @@ def read_value(where: str, key: str, declared: Declaration, value: Any) -> Any:
         raise InputError(
             f"{where}: {key} must be a number in [{low:g}, {high:g}], not {shown(value)}"
         )
+    given = shown(value) if isinstance(value, int) else f"{value:g}"
     value = as_float(value)
     slack = 1e-12 * max(abs(low), abs(high))  # a bound survives the round trip through degrees
     if not low - slack <= value <= high + slack:  # false for NaN too
-        raise InputError(f"{where}: {key} = {value:g} is outside its range [{low:g}, {high:g}]")
+        raise InputError(f"{where}: {key} = {given} is outside its range [{low:g}, {high:g}]")
     if declared.whole:
         if value != int(value):
             raise InputError(f"{where}: {key} must be a whole number, not {value:g}")

@@ -13,6 +13,8 @@ from countersteer.reading.values import shown
 
 if TYPE_CHECKING:
     from countersteer.car.car import Car
+    from countersteer.recorded_drive import Drive
+    from countersteer.runs.run import Run
 
 
 INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
@@ -44,15 +46,7 @@ def run(options: argparse.Namespace) -> int:
     if not options.compare:
         set_up(options)
     from countersteer.car.files import load_car
-    from countersteer.course.files import course_of_run
-    from countersteer.drivers.registry import replay
-    from countersteer.estimation.dead_reckoning import DeadReckoning
-    from countersteer.pilot import Pilot
-    from countersteer.recorded_drive import Drive, about_run
-    from countersteer.runs.files import LONGEST, read_commands
     from countersteer.runs.run import read_run
-    from countersteer.simulator import Simulator
-    from countersteer.world.floor import floor_of_run
 
     if options.horizon and not options.compare:
         raise InputError("--horizon is of a comparison: give --compare as well")
@@ -73,6 +67,20 @@ def run(options: argparse.Namespace) -> int:
         if run is None:
             raise InputError("--compare needs a run folder, such as import makes")
         return run_compare(options, run, car, name)
+    return record(options, replayed(options, run, car, name), options.source.stem)
+
+
+def replayed(options: argparse.Namespace, run: "Run | None", car: "Car", name: str) -> "Drive":
+    """The drive that replays a run's commands, or those of a `commands.csv`."""
+    from countersteer.course.files import course_of_run
+    from countersteer.drivers.registry import replay
+    from countersteer.estimation.dead_reckoning import DeadReckoning
+    from countersteer.pilot import Pilot
+    from countersteer.recorded_drive import Drive, about_run
+    from countersteer.runs.files import LONGEST, read_commands
+    from countersteer.simulator import Simulator
+    from countersteer.world.floor import floor_of_run
+
     commands = run.commands if run else read_commands(options.source)
     pose, velocity = read_initial(options.initial)
     if run is not None and not options.initial:
@@ -108,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
     last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
     longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
     about = about_run(simulator, pilot, course, "replay", name, laps, car, {"kind": "replay"})
-    return record(options, Drive(simulator, pilot, course, about, longest), options.source.stem)
+    return Drive(simulator, pilot, course, about, longest)
 
 
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:

@@ -107,17 +107,19 @@ def _read(log: Path) -> tuple[np.ndarray, np.ndarray]:
     def place(row: int) -> str:
         return f"{log}, row {row} ({row * PERIOD:.2f} s)"
 
-    for name, array, width in (("obs", observed, OBSERVED), ("action", asked, ASKED)):
+    for name, array, width, most in (
+        ("obs", observed, OBSERVED, LARGEST),
+        ("action", asked, ASKED, 1.0),
+    ):
         if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
             raise InputError(f"{log}: not an ETH log: '{name}' must be numbers (N, {width})")
         require(place, np.all(np.isfinite(array), axis=1), f"{name} is not a number")
-        most = np.max(np.abs(array), axis=1, initial=0.0)
-        require(place, most <= LARGEST, f"{name} must be in [-{LARGEST:g}, {LARGEST:g}]")
+        within = np.all(np.abs(array) <= most, axis=1)
+        require(place, within, f"{name} must be in [-{most:g}, {most:g}]")
     if len(observed) != len(asked) or len(observed) < 2:
         raise InputError(
             f"{log}: 'obs' and 'action' must be as long as each other, two rows or more"
         )
     if len(observed) > MOST_ROWS:
         raise InputError(f"{log}: {len(observed)} rows, over {MOST_ROWS}")
-    require(place, np.all(np.abs(asked) <= 1, axis=1), "action must be in [-1, 1]")
     return observed, asked
