@@ -7,7 +7,7 @@ import dataclasses
 import difflib
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
@@ -15,6 +15,8 @@ import jax
 from countersteer.errors import InputError
 from countersteer.reading.values import as_float, short, shown
 from countersteer.signals import Scalar
+
+MOST_LISTED = 200  # characters
 
 T = typing.TypeVar("T")
 
@@ -146,8 +148,14 @@ def changed(part: T, path: str, value: Scalar) -> T:
     return replaced
 
 
+def listed(names: Iterable[str]) -> str:
+    """Names for a message, without those that make it too long."""
+    whole = ", ".join(names)
+    return whole if len(whole) <= MOST_LISTED else f"{whole[:MOST_LISTED].rpartition(',')[0]}, …"
+
+
 def unknown_key(where: str, key: str, known: Mapping[str, Any]) -> InputError:
     """The error for an undeclared key. It names the nearest declared key, or else all."""
     near = difflib.get_close_matches(key[:100], known, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
+    hint = f"; did you mean {near[0]}?" if near else f"; known: {listed(known)}"
     return InputError(f"{where}: unknown key {short(key)}{hint}")

@@ -72,7 +72,10 @@ class Animation:
             raise InputError(f"{run.path}: has no truth.csv, so there is no path to draw")
         pose = np.column_stack([run.truth[name] for name in ("x_m", "y_m", "heading_rad")])
         known = np.all(np.abs(pose) <= FARTHEST, axis=1)  # false for NaN too
-        truth = {name: column[known] for name, column in run.truth.items()}
+        truth = {
+            name: np.where(np.abs(column[known]) <= FARTHEST, column[known], math.nan)
+            for name, column in run.truth.items()
+        }
         if np.sum(known) < 2:
             raise InputError(f"{run.path}/truth.csv: holds fewer than two poses")
         self._time, self._pose = truth["time_s"], pose[known]
@@ -156,7 +159,7 @@ class Animation:
         wheels = picture.placed(hubs, pose).swapaxes(0, 1)
         colours, marks = [SOFT] * len(time), np.zeros((4, len(time)))
         if slip is not None:
-            end = max(math.radians(20), float(np.nanmax(np.abs(slip))))
+            end = max(math.radians(20), float(np.max(np.nan_to_num(np.abs(slip)))))
             colours = [ramp(part) for part in (np.abs(at(slip)) / end).tolist()]
         names = [f"wheel_{wheel}_radps" for wheel in ("fl", "fr", "rl", "rr")]
         if slip is not None and {"yaw_rate_radps", *names} <= set(truth):

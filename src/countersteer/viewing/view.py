@@ -32,11 +32,6 @@ def view_of(run: Run) -> dict[str, Any]:
 
     Raises `InputError` if the run has no `truth.csv`, or one without a simulated car's columns.
     """
-    if run.truth is None or len(run.truth) == 0:
-        raise InputError(f"{run.path}: has no truth.csv to draw")
-    for name in COLUMNS:
-        if name not in run.truth:
-            raise InputError(f"{run.path}/truth.csv: has no {name}: this page is of simulated runs")
     about, car = run.about, drawn_car(run.about)
     run = dataclasses.replace(run, truth=known_rows(run))
     truth = run.truth
@@ -81,8 +76,15 @@ def view_of(run: Run) -> dict[str, Any]:
 
 
 def known_rows(run: Run) -> Table:
-    """The rows of `truth.csv` whose numbers can all be drawn. Raises `InputError` without one."""
-    assert run.truth is not None
+    """The rows of `truth.csv` whose numbers can all be drawn.
+
+    Raises `InputError` without one, or without a column of a simulated run.
+    """
+    if run.truth is None or len(run.truth) == 0:
+        raise InputError(f"{run.path}: has no truth.csv to draw")
+    for name in COLUMNS:
+        if name not in run.truth:
+            raise InputError(f"{run.path}/truth.csv: has no {name}: this page is of simulated runs")
     drawn = [run.truth[name] for name in ("time_s", "x_m", "y_m", "heading_rad", *COLUMNS)]
     known = np.all(np.abs(drawn) <= LARGEST, axis=0)  # false for NaN too
     if not np.any(known):
