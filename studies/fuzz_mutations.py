@@ -39,7 +39,7 @@ def mutated(random: Random, name: str, content: bytes) -> bytes:
     """The content with one to three mutations that suit the file's name."""
     known = [flipped, cut, removed, repeated, inserted, encoded]
     if not name.endswith((".png", ".npz")):
-        known += [line_changed] * 3 + [cell_changed] * 8
+        known += [line_changed] * 3 + [cell_changed] * 8 + [number_changed] * 12
     known += {
         ".toml": [key_changed] * 10,
         ".json": [json_changed] * 10,
@@ -131,6 +131,21 @@ def cell_changed(random: Random, content: bytes) -> bytes:
         return b"\n".join(b",".join(cells) for cells in lines)
     one = random.choice(found)
     return content[: one.start()] + nasty + content[one.end() :]
+
+
+def number_changed(random: Random, content: bytes) -> bytes:
+    """A few numbers replaced by others that may be meant: scaled, moved, of the other sign, 0."""
+    for _ in range(random.choice((1, 1, 2, 5))):
+        found = [*re.finditer(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?", content)]
+        if not found:
+            return content
+        one = random.choice(found)
+        value = max(-1e300, min(1e300, float(one[0])))
+        factor = random.choice((0.0, -1.0, 0.01, 0.5, 0.999999, 1.000001, 2.0, 10.0, 1000.0))
+        other = value * factor + random.choice((0.0, 0.0, 1.0, random.gauss(0.0, 1.0)))
+        text = random.choice((f"{other:.6g}", repr(round(other)), f"{other:.3f}"))
+        content = content[: one.start()] + text.encode() + content[one.end() :]
+    return content
 
 
 def key_changed(random: Random, content: bytes) -> bytes:

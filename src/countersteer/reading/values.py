@@ -8,7 +8,7 @@ from countersteer.errors import InputError
 
 MOST_SHOWN = 80  # characters of a value or a name in a message
 MOST_DIGITS = 30  # of a whole number that is shown in full
-LONGEST_NAME = 100  # characters
+LONGEST_NAME, LONGEST_PATH = 100, 250  # characters
 
 
 class _Shortened(reprlib.Repr):
@@ -18,7 +18,7 @@ class _Shortened(reprlib.Repr):
         """A whole number; long ones by their size, as Python converts no more than 4300 digits."""
         if x.bit_length() < 3.3 * MOST_DIGITS:
             return repr(x)
-        return f"a whole number of {int(x.bit_length() * math.log10(2)) + 1} digits"
+        return f"a whole number of some {x.bit_length() * math.log10(2):.0f} digits"
 
 
 _shortened = _Shortened()
@@ -85,6 +85,6 @@ def name(value: Any, where: str) -> str:
 
 def path(value: Any, where: str) -> str:
     """The text `value`, a name in a library or the path of a file. Raises `InputError`."""
-    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 1000:
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= LONGEST_PATH:
         raise InputError(f"{where} must be a name or a path, not {shown(value)}")
     return value

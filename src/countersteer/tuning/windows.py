@@ -315,7 +315,7 @@ def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[
 
 
 def _slope(signal: Signal) -> Signal:
-    """The derivative of a signal; 0 for a signal of one sample. Of equal times, the first counts."""
+    """The derivative of a signal; 0 for one sample. Of equal times, the first counts."""
     time, rows = np.unique(signal.time, return_index=True)
     if len(time) < 2:
         return signal._replace(value=0.0 * signal.value)
