@@ -81,6 +81,13 @@ offset_m = 0.1
 [goal]
 distance_m = 14.0
 """
+OPEN = """width_m = 1.0
+crosses = true
+segments = [{length_m = 3.0}, {turn_deg = 90.0}, {straight_m = 2.0},
+  {turn_deg = -60.0, radius_m = 0.5},
+  {length_m = 2.0},
+]
+"""
 WALLS = """name = "yard"
 walls_m = [[[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]], [[1.5, 1.5], [2, 2]]]
 [start]
@@ -136,6 +143,7 @@ def formats() -> dict[str, Format]:
     made = (
         Format("car", {"c.toml": CAR.encode()}, ("c.toml",), _car),
         Format("course", {"c.toml": SEGMENTS.encode()}, ("c.toml",), _course("c.toml")),
+        Format("open-course", {"c.toml": OPEN.encode()}, ("c.toml",), _course("c.toml")),
         Format("walls", {"c.toml": WALLS.encode()}, ("c.toml",), _course("c.toml")),
         Format("centre-line", {"c.csv": centre_line()}, ("c.csv",), _course("c.csv")),
         Format(

@@ -1,5 +1,6 @@
 """Files that are damaged, hostile or of another kind: read right, or refused in one line."""
 
+import json
 import os
 import shutil
 import time
@@ -353,6 +354,10 @@ def test_a_bad_log_does_not_keep_the_others_from_being_imported(
     assert line.startswith(f"countersteer: {files[1]}: ")
     for name in ("first", "last"):
         assert len(read_run(tmp_path / "out" / name).commands) > 10
+    assert cli.main([*arguments, "--json"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert [Path(run["run"]).name for run in told["runs"]] == ["first", "last"]
+    assert [one["file"] for one in told["failed"]] == [str(files[1])]
 
 
 def test_a_number_of_any_length_in_a_table_is_a_number_or_refused(tmp_path):

@@ -12,7 +12,7 @@ from countersteer.reading.content import read_text, reading
 from countersteer.reading.documents import toml
 from countersteer.reading.values import short, shown
 
-LARGEST_TOML = 10  # MB, of a file that is written by hand
+LARGEST_TOML = 2  # MB, of a file that is written by hand; the parser reads some MB a second
 FORMAT = 1  # of the files that this version writes, and the latest that it reads
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from countersteer.cli.options import DONE, Verbs, number, physics
 from countersteer.cli.recorded import record, set_up
 from countersteer.errors import InputError
+from countersteer.reading.content import reading
 from countersteer.reading.values import shown
 
 if TYPE_CHECKING:
@@ -52,9 +53,10 @@ def run(options: argparse.Namespace) -> int:
         raise InputError("--horizon is of a comparison: give --compare as well")
     if options.initial and options.compare:
         raise InputError("--initial: --compare starts from what was measured")
-    run = read_run(options.source) if options.source.is_dir() else None
-    if run is None and not options.source.exists():
-        raise InputError(f"{options.source}: no such run folder or commands.csv")
+    with reading(options.source):
+        run = read_run(options.source) if options.source.is_dir() else None
+        if run is None and not options.source.exists():
+            raise InputError(f"{options.source}: no such run folder or commands.csv")
     if options.battery is not None and run is not None:
         about = {**run.about, "battery_charge": options.battery}
         run = dataclasses.replace(run, about=about)

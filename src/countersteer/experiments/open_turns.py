@@ -18,6 +18,7 @@ from countersteer.car.car import Car
 from countersteer.drivers.open_turn import open_turn
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
+from countersteer.reading.content import reading
 from countersteer.runs.files import Table, read_table
 from countersteer.runs.run import Run, drawn_car, read_run
 from countersteer.task.turns import sideslip
@@ -252,11 +253,14 @@ def read_turns(path: Path) -> Table:
 
     Raises `InputError` if a number is missing or impossible for a stop.
     """
-    if path.is_dir() and (path / "run.toml").exists():
+    with reading(path):
+        is_folder = path.is_dir()
+        file = path / "turns.csv" if is_folder else path
+        is_run = is_folder and (path / "run.toml").exists()
+        if not is_run and not file.exists():
+            raise InputError(f"{path}: no such table of turns, nor a run's folder")
+    if is_run:
         return as_table(of_run(path))
-    file = path / "turns.csv" if path.is_dir() else path
-    if not file.exists():
-        raise InputError(f"{path}: no such table of turns, nor a run's folder")
     table = read_table(file, COLUMNS[:6], text=WORDS)
     other = ~np.isin(table["hand"], ("left", "right"))
     if np.any(other):
