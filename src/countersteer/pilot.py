@@ -32,6 +32,7 @@ from countersteer.estimation.registry import ESTIMATORS
 from countersteer.kept_programs import kept
 from countersteer.link.link import LINKS, ONBOARD, Link
 from countersteer.random_streams import Stream
+from countersteer.reading.values import shown
 from countersteer.signals import Array, Command, Reading, Readings, Scalar
 
 PYTHON_PERIOD = 0.005  # s, default time between two decisions of a driver in plain Python
@@ -248,13 +249,17 @@ def pilot_of_run(about: Mapping[str, Any], read: Read) -> Pilot:
         raise InputError("run.toml: tells no [nominal] car or no [course]: it holds no pilot")
     if about.get("estimate") not in ESTIMATORS or about["estimate"] == "truth":
         raise InputError(
-            f"run.toml: estimate {about.get('estimate')}: it needs what no car reports"
+            f"run.toml: estimate {shown(about.get('estimate'))}: it needs what no car reports"
         )
+    try:
+        driver_tables, laps, bits = about["pilot"], int(about["laps"]), about["precision_bits"]
+        link, dt = LINKS[about["link"]["name"]], float(about["rates"]["dt_s"])
+    except KeyError as error:
+        raise InputError(f"run.toml: {error.args[0]} is missing, or is not known") from None
     nominal = car_from_tables(about["nominal"], "run.toml: nominal")
-    driver = driver_of_tables(about["pilot"], course, nominal, int(about["laps"]), read)
-    link, dt = LINKS[about["link"]["name"]], float(about["rates"]["dt_s"])
+    driver = driver_of_tables(driver_tables, course, nominal, laps, read)
     pilot = Pilot.of(driver, course, nominal, str(about["estimate"]), link, dt)
-    return pilot.typed(np.float32) if about["precision_bits"] == 32 else pilot
+    return pilot.typed(np.float32) if bits == 32 else pilot
 
 
 def traceable(driver: Any) -> bool:

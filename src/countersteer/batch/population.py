@@ -15,12 +15,15 @@ from countersteer.car.parameter import Declaration, changed, declarations, unkno
 from countersteer.course.course import Course
 from countersteer.errors import InputError
 from countersteer.random_streams import Stream
+from countersteer.reading.content import reading
+from countersteer.reading.values import number, short
 from countersteer.signals import Array, Scalar
 from countersteer.text import read_toml
 from countersteer.world import floor
 from countersteer.world.floor import LARGEST, Floor
 
 LIBRARY = importlib.resources.files("countersteer.batch") / "library"
+MOST_VARIED = 500
 KINDS = ("within", "plus", "low", "high")
 START = {"along_m": 1.0, "offset_m": 1.0, "heading_deg": math.pi / 180}  # factors to SI
 
@@ -61,11 +64,21 @@ class Drawn(NamedTuple):
 
 def load_population(name: str) -> Population:
     """Load a set from the library or a file. Raises `InputError` with file and key."""
+    with reading(short(name)):
+        return _load(name)
+
+
+def _load(name: str) -> Population:
     tables, where = read_toml(name, LIBRARY, "set of cars")
     for key in tables:
         if key not in ("description", "vary", "start", "floor"):
             raise unknown_key(where, key, {"vary": 0, "start": 0, "floor": 0})
+    for table_name in ("vary", "start", "floor"):
+        if not isinstance(tables.get(table_name, {}), dict):
+            raise InputError(f"{where}: {table_name} must be a table")
     varied = tuple(_varied(where, key, entry) for key, entry in tables.get("vary", {}).items())
+    if len(varied) > MOST_VARIED:
+        raise InputError(f"{where}: vary has {len(varied)} keys, over {MOST_VARIED}")
     start, ground = tables.get("start", {}), tables.get("floor", {})
     for table, known in (
         (start, ("charge", *START)),
@@ -77,27 +90,22 @@ def load_population(name: str) -> Population:
     charge = start.get("charge", [1.0, 1.0])
     if not (isinstance(charge, list) and len(charge) == 2):
         raise InputError(f"{where}: start.charge must be [low, high] within [0, 1]")
-    low, high = (_number(where, "start.charge", value, 0, 1) for value in charge)
+    low, high = (number(value, f"{where}: start.charge", 0, 1) for value in charge)
     if low > high:
         raise InputError(f"{where}: start.charge must be [low, high] within [0, 1]")
     most = (
-        factor * _number(where, f"start.{key}", start.get(key, 0.0), 0, 360)
+        factor * number(start.get(key, 0.0), f"{where}: start.{key}", 0, 360)
         for key, factor in START.items()
     )
-    deviation = _number(where, "floor.deviation", ground.get("deviation", 0.0), 0, LARGEST)
-    length = _number(where, "floor.length_m", ground.get("length_m", 0.5), 0.01, 100)
+    deviation = number(ground.get("deviation", 0.0), f"{where}: floor.deviation", 0, LARGEST)
+    length = number(ground.get("length_m", 0.5), f"{where}: floor.length_m", 0.01, 100)
     along, offset, heading = most
     return Population(name, varied, (low, high), (along, offset, heading), (deviation, length))
 
 
-def _number(where: str, key: str, value: Any, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise InputError(f"{where}: {key} must be a number in [{low:g}, {high:g}], not {value!r}")
-    return float(value)
-
-
 def _varied(where: str, key: str, entry: Any) -> Varied:
     """One line of `[vary]`."""
+    at = f"{where}: {short(key)}"
     paths, declared, factors = [], [], []
     for path in key.split(","):
         inside, found, factor = locate(where, path.strip())
@@ -105,17 +113,17 @@ def _varied(where: str, key: str, entry: Any) -> Varied:
         declared.append(found)
         factors.append(factor)
     if not isinstance(entry, dict) or not entry or set(entry) - set(KINDS):
-        raise InputError(f"{where}: {key} must be a table of {', '.join(KINDS)}")
+        raise InputError(f"{at} must be a table of {', '.join(KINDS)}")
     if len({"low", "high"} & set(entry)) == 1 or ("low" in entry and len(entry) > 2):
-        raise InputError(f"{where}: {key} needs low and high together, and nothing beside them")
+        raise InputError(f"{at} needs low and high together, and nothing beside them")
     factor = factors[0]
     ends = None
     if "low" in entry:
         bounds = (declared[0].low / factor, declared[0].high / factor)
-        low, high = (_number(where, f"{key}.{end}", entry[end], *bounds) for end in ("low", "high"))
+        low, high = (number(entry[end], f"{at}.{end}", *bounds) for end in ("low", "high"))
         ends = (factor * low, factor * high)
-    within = _number(where, f"{key}.within", entry.get("within", 0.0), 0, 1)
-    plus = factor * _number(where, f"{key}.plus", entry.get("plus", 0.0), 0, 1e6)
+    within = number(entry.get("within", 0.0), f"{at}.within", 0, 1)
+    plus = factor * number(entry.get("plus", 0.0), f"{at}.plus", 0, 1e6)
     return Varied(tuple(paths), tuple(declared), within, plus, ends)
 
 
@@ -128,10 +136,14 @@ def locate(where: str, path: str) -> tuple[str, Declaration, float]:
     for room in rooms:
         part = getattr(part, room, None)
         if not dataclasses.is_dataclass(part):
-            raise InputError(f"{where}: unknown parameter {path} ('list parameters' has them all)")
+            raise InputError(
+                f"{where}: unknown parameter {short(path)} ('list parameters' has them all)"
+            )
     known = declarations(type(part))
     if key not in known or known[key][1].choices:
-        raise InputError(f"{where}: unknown parameter {path} ('list parameters' has them all)")
+        raise InputError(
+            f"{where}: unknown parameter {short(path)} ('list parameters' has them all)"
+        )
     name, declared = known[key]
     return ".".join([*rooms, name]), declared, EDGE[declared.unit][1]
 
@@ -147,9 +159,9 @@ def draw(
     """Draw a car, charge, start, speed and floor for each seed, around a nominal car."""
     count = len(population.varied) + 5
     even = np.array([np.random.default_rng(seed).uniform(-1, 1, count) for seed in seeds])
-    for number, entry in enumerate(population.varied):
+    for i, entry in enumerate(population.varied):
         for path, declared in zip(entry.paths, entry.declared, strict=True):
-            u = even[:, number]
+            u = even[:, i]
             if entry.ends is not None:
                 value = _between(entry.ends, u)
             else:

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.resources
 import math
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,14 @@ from countersteer.car.parameter import (
     write_value,
 )
 from countersteer.errors import InputError
+from countersteer.reading.content import reading
+from countersteer.reading.values import path as checked_path
+from countersteer.reading.values import short, shown
 from countersteer.text import read_toml, toml_of
 from countersteer.writing import write_whole
 
 LIBRARY = importlib.resources.files("countersteer.car") / "library"
+MOST_BASES, MOST_MOUNTS = 16, 64
 
 
 def library() -> list[str]:
@@ -35,7 +40,8 @@ def load_car(name: str, overrides: Iterable[str] = ()) -> Car:
 
     Leaves are 64-bit numbers. Raises `InputError` naming file, key and range.
     """
-    car = _load(name, ())
+    with reading(short(name)):
+        car = _load(name, ())
     for override in overrides:
         path, sign, text = override.partition("=")
         if not sign or not path:
@@ -79,11 +85,13 @@ def _load(name: str, seen: tuple[Path, ...]) -> Car:
             raise InputError(f"{where}: holds no parameter: give a base, or tables such as [body]")
         return _merge(Car(), tables, where, "")
     seen = (*seen, Path(name).resolve())
-    if isinstance(base, str):
-        other = str(Path(name).parent / base) if base.endswith(".toml") else base
-        if Path(other).resolve() not in seen:
-            return _merge(_load(other, seen), tables, where, "")
-    raise InputError(f"{where}: base must name another car, not {base!r}")
+    if len(seen) > MOST_BASES:
+        raise InputError(f"{where}: base: over {MOST_BASES} cars, each the base of another")
+    base = checked_path(base, f"{where}: base")
+    other = str(Path(name).parent / base) if base.endswith(".toml") else base
+    if Path(other).resolve() in seen:
+        raise InputError(f"{where}: base must name another car, not {shown(base)}")
+    return _merge(_load(other, seen), tables, where, "")
 
 
 def _merge(part: Any, table: Any, where: str, path: str) -> Any:
@@ -116,7 +124,13 @@ def _mounts(sonar: Sonar, table: Any, where: str, path: str) -> dict[str, Any]:
         raise InputError(f"{where}: {path.rstrip('.')} must be a table of mounts")
     mounts = dict(zip(sonar.mount_names, sonar.mounts, strict=True))
     for name, entry in table.items():
+        if not re.fullmatch(r"[\w-]{1,40}", name):  # it names a column of a log
+            raise InputError(
+                f"{where}: {path}{short(name)}: a mount's name has up to 40 letters, digits, _ or -"
+            )
         mounts[name] = _merge(mounts.get(name, Mount()), entry, where, f"{path}{name}.")
+    if len(mounts) > MOST_MOUNTS:
+        raise InputError(f"{where}: {path.rstrip('.')}: {len(mounts)} mounts, over {MOST_MOUNTS}")
     return {"mount_names": tuple(mounts), "mounts": tuple(mounts.values())}
 
 
@@ -140,11 +154,13 @@ def car_tables(part: Any) -> dict[str, Any]:
 
 
 def car_from_tables(tables: dict[str, Any], where: str) -> Car:
-    """The inverse of `car_tables`."""
+    """The inverse of `car_tables`. Raises `InputError` naming `where`."""
     empty = dataclasses.replace(
         Car(), sensors=dataclasses.replace(Car().sensors, sonar=Sonar(mount_names=(), mounts=()))
     )
-    return jax.tree.map(np.float64, _merge(empty, tables, where, ""))
+    car = _merge(empty, tables, where, "")
+    check(car, where)
+    return jax.tree.map(np.float64, car)
 
 
 def save_car(car: Car, path: Path, source: dict[str, str]) -> None:

@@ -7,13 +7,16 @@ import dataclasses
 import difflib
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
 
 from countersteer.errors import InputError
+from countersteer.reading.values import as_float, short, shown
 from countersteer.signals import Scalar
+
+MOST_LISTED = 200  # characters
 
 T = typing.TypeVar("T")
 
@@ -102,16 +105,20 @@ def read_value(where: str, key: str, declared: Declaration, value: Any) -> Any:
     Raises `InputError` with the place, the key and the range.
     """
     if declared.choices:
-        if value not in declared.choices:
+        if not isinstance(value, str) or value not in declared.choices:
             raise InputError(f"{where}: {key} must be one of {', '.join(declared.choices)}")
         return value
     factor = EDGE[declared.unit][1]
     low, high = declared.low / factor, declared.high / factor
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{where}: {key} must be a number in [{low:g}, {high:g}], not {value!r}")
+        raise InputError(
+            f"{where}: {key} must be a number in [{low:g}, {high:g}], not {shown(value)}"
+        )
+    given = shown(value) if isinstance(value, int) else f"{value:g}"
+    value = as_float(value)
     slack = 1e-12 * max(abs(low), abs(high))  # a bound survives the round trip through degrees
     if not low - slack <= value <= high + slack:  # false for NaN too
-        raise InputError(f"{where}: {key} = {value:g} is outside its range [{low:g}, {high:g}]")
+        raise InputError(f"{where}: {key} = {given} is outside its range [{low:g}, {high:g}]")
     if declared.whole:
         if value != int(value):
             raise InputError(f"{where}: {key} must be a whole number, not {value:g}")
@@ -141,8 +148,14 @@ def changed(part: T, path: str, value: Scalar) -> T:
     return replaced
 
 
+def listed(names: Iterable[str]) -> str:
+    """Names for a message, without those that make it too long."""
+    whole = ", ".join(names)
+    return whole if len(whole) <= MOST_LISTED else f"{whole[:MOST_LISTED].rpartition(',')[0]}, …"
+
+
 def unknown_key(where: str, key: str, known: Mapping[str, Any]) -> InputError:
     """The error for an undeclared key. It names the nearest declared key, or else all."""
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
-    return InputError(f"{where}: unknown key {key}{hint}")
+    near = difflib.get_close_matches(key[:100], known, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]}?" if near else f"; known: {listed(known)}"
+    return InputError(f"{where}: unknown key {short(key)}{hint}")

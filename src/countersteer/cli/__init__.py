@@ -37,7 +37,7 @@ from countersteer.cli.options import (
     Progress,
     Verbs,
     complain,
-    in_one_line,
+    one_line,
 )
 from countersteer.errors import InputError
 from countersteer.progress import waiting
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
         return status
     except InputError as error:
-        complain(in_one_line(error))
+        complain(one_line(error))
         return WRONG_INPUT
     except KeyboardInterrupt:
         complain("interrupted")

@@ -36,15 +36,15 @@ def run(options: argparse.Namespace) -> int:
     module, car = experiments.load(options.name), load_car(options.car, options.set)
     if options.runs and not hasattr(module, "measure"):
         raise InputError(f"--from: {options.name} is simulated, and measures no run")
+    # A run that cannot be measured leaves no folder.
+    measured = module.measure([read_run(path) for path in options.runs]) if options.runs else None
     with new_folder(options.out, options.name) as folder:
-        with Progress(options.json) as progress:
-            if options.runs:
-                found = module.measure([read_run(path) for path in options.runs])
-            else:
-                found = module.simulate(car, Path(options.car).stem, progress.show)
-        result = write(found, folder, options.name)
+        if measured is None:
+            with Progress(options.json) as progress:
+                measured = module.simulate(car, Path(options.car).stem, progress.show)
+        result = write(measured, folder, options.name)
     if options.json:
         print(json.dumps(result | {"out": str(folder)}))
     else:
-        print(f"{found.text}\ntable, picture: {folder}")
+        print(f"{measured.text}\ntable, picture: {folder}")
     return DONE

@@ -2,9 +2,12 @@
 
 import argparse
 import json
+import sys
 from pathlib import Path
+from typing import Any
 
-from countersteer.cli.options import DONE, Verbs
+from countersteer.cli.options import DONE, WRONG_INPUT, Verbs, one_line
+from countersteer.errors import InputError
 from countersteer.runs.importers import FORMATS, importer
 
 
@@ -19,11 +22,19 @@ def add(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """`import`."""
-    to_run, results = importer(options.format), []
+    to_run = importer(options.format)
+    results: list[dict[str, Any]] = []
+    failed: list[dict[str, str]] = []
     for file in options.files:
-        results.append(to_run(file, options.out))
+        try:
+            results.append(to_run(file, options.out))
+        except InputError as error:  # a bad log does not keep the others from being imported
+            failed.append({"file": str(file), "error": one_line(error)})
+            continue
         if not options.json:
             print(f"{file.name} -> {options.out / file.stem}")
     if options.json:
-        print(json.dumps({"runs": results}))
-    return DONE
+        print(json.dumps({"runs": results} | ({"failed": failed} if failed else {})))
+    for one in failed:
+        print(f"countersteer: {one['error']}", file=sys.stderr)
+    return WRONG_INPUT if failed else DONE

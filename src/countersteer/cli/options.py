@@ -20,6 +20,12 @@ DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 Handler = Callable[[argparse.Namespace], int]
 
 
+def one_line(error: BaseException) -> str:
+    """An error's message in one line of printable characters."""
+    line = " ".join(str(error).split())
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line."""
 

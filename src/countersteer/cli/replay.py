@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 from countersteer.cli.options import DONE, Verbs, number, physics
 from countersteer.cli.recorded import record, set_up
 from countersteer.errors import InputError
+from countersteer.reading.content import reading
+from countersteer.reading.values import shown
 
 if TYPE_CHECKING:
     from countersteer.car.car import Car
+    from countersteer.recorded_drive import Drive
+    from countersteer.runs.run import Run
 
 
-LONGEST_REPLAY = 3600.0  # s
 INITIAL = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
 
 
@@ -44,23 +47,16 @@ def run(options: argparse.Namespace) -> int:
     if not options.compare:
         set_up(options)
     from countersteer.car.files import load_car
-    from countersteer.course.files import course_of_run
-    from countersteer.drivers.registry import replay
-    from countersteer.estimation.dead_reckoning import DeadReckoning
-    from countersteer.pilot import Pilot
-    from countersteer.recorded_drive import Drive, about_run
-    from countersteer.runs.files import read_commands
     from countersteer.runs.run import read_run
-    from countersteer.simulator import Simulator
-    from countersteer.world.floor import floor_of_run
 
     if options.horizon and not options.compare:
         raise InputError("--horizon is of a comparison: give --compare as well")
     if options.initial and options.compare:
         raise InputError("--initial: --compare starts from what was measured")
-    run = read_run(options.source) if options.source.is_dir() else None
-    if run is None and not options.source.exists():
-        raise InputError(f"{options.source}: no such run folder or commands.csv")
+    with reading(options.source):
+        run = read_run(options.source) if options.source.is_dir() else None
+        if run is None and not options.source.exists():
+            raise InputError(f"{options.source}: no such run folder or commands.csv")
     if options.battery is not None and run is not None:
         about = {**run.about, "battery_charge": options.battery}
         run = dataclasses.replace(run, about=about)
@@ -73,6 +69,20 @@ def run(options: argparse.Namespace) -> int:
         if run is None:
             raise InputError("--compare needs a run folder, such as import makes")
         return run_compare(options, run, car, name)
+    return record(options, replayed(options, run, car, name), options.source.stem)
+
+
+def replayed(options: argparse.Namespace, run: "Run | None", car: "Car", name: str) -> "Drive":
+    """The drive that replays a run's commands, or those of a `commands.csv`."""
+    from countersteer.course.files import course_of_run
+    from countersteer.drivers.registry import replay
+    from countersteer.estimation.dead_reckoning import DeadReckoning
+    from countersteer.pilot import Pilot
+    from countersteer.recorded_drive import Drive, about_run
+    from countersteer.runs.files import LONGEST, read_commands
+    from countersteer.simulator import Simulator
+    from countersteer.world.floor import floor_of_run
+
     commands = run.commands if run else read_commands(options.source)
     pose, velocity = read_initial(options.initial)
     if run is not None and not options.initial:
@@ -103,12 +113,12 @@ def run(options: argparse.Namespace) -> int:
         floor=floor_of_run(run.about) if run else None,
     )
     times = commands["time_s"]
-    if times[-1] > LONGEST_REPLAY:
+    if times[-1] > LONGEST:
         raise InputError(f"{options.source}: commands go on to {times[-1]:g} s, over an hour")
     last = float(times[-1] - times[-2]) if len(times) > 1 else 1.0
     longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
     about = about_run(simulator, pilot, course, "replay", name, laps, car, {"kind": "replay"})
-    return record(options, Drive(simulator, pilot, course, about, longest), options.source.stem)
+    return Drive(simulator, pilot, course, about, longest)
 
 
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:
@@ -155,7 +165,7 @@ def read_initial(text: str) -> tuple[tuple[float, float, float], tuple[float, fl
         try:
             values[name] = float(value)
         except ValueError:
-            raise InputError(f"--initial: {name} must be a number, not {value!r}") from None
+            raise InputError(f"--initial: {name} must be a number, not {shown(value)}") from None
         if not abs(values[name]) <= 1000:
             raise InputError(f"--initial: {name} must be in [-1000, 1000]")
     x, y, heading, vx, vy, yaw_rate = values.values()

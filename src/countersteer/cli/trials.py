@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from countersteer.cli.options import CHARGES, DONE, SPEEDS, Progress, Verbs, nominal_car, number
+from countersteer.errors import InputError
 
 
 def add(verbs: Verbs) -> None:
@@ -64,6 +65,8 @@ def run_turns(options: argparse.Namespace) -> int:
 
     if options.runs:
         rows = [row for path in options.runs for row in open_turns.of_run(path)]
+        if not rows:
+            raise InputError(f"--from: {len(options.runs)} runs, and no turn that was stopped")
         tried, title = None, ", ".join(path.name for path in options.runs[:2])
         title += f" and {len(options.runs) - 2} more" if len(options.runs) > 2 else ""
     else:

@@ -1,5 +1,6 @@
 """Closed courses from centre lines with widths: the CSV files of F1TENTH and its relatives."""
 
+import contextlib
 import re
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,15 @@ import shapely
 
 from countersteer.course.course import Course, from_track, walls_around
 from countersteer.errors import InputError
+from countersteer.reading.content import read_text
+from countersteer.reading.values import number
 
 COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # in this order without a header
 ALIASES = {"d_right": "w_tr_right_m", "d_left": "w_tr_left_m"}
 SAME = 1e-3  # m within which two points count as one
 TOLERANCE = 0.01  # of the mean width: largest distance of walls from the corridor's true edge
 MOST_POINTS = 20_000
+LARGEST = 10  # MB
 NARROWEST, WIDEST, FARTHEST = 0.05, 1e3, 1e5  # m
 
 
@@ -52,14 +56,10 @@ def read_centre_line(path: Path) -> Course:
 
 def _rows(path: Path) -> np.ndarray:
     """The numbers of the file (n, 4), in the order of `COLUMNS`."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise InputError(f"{path}: cannot be read: {reason}") from None
+    lines = read_text(path, LARGEST).splitlines()
     names: list[str] = list(COLUMNS)
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=1):
+    for at, line in enumerate(lines, start=1):
         cells = _cells(line.lstrip("# \t"))
         if "x_m" in cells:
             names = [ALIASES.get(cell, cell) for cell in cells]
@@ -68,12 +68,12 @@ def _rows(path: Path) -> np.ndarray:
                     raise InputError(f"{path}: column {column} is missing")
         elif line.strip() and not line.lstrip().startswith("#"):
             if len(cells) < len(names):
-                raise InputError(f"{path}, line {number}: {len(cells)} cells, not {len(names)}")
-            rows.append(
-                [_number(cells[names.index(c)], c, f"{path}, line {number}") for c in COLUMNS]
-            )
+                raise InputError(f"{path}, line {at}: {len(cells)} cells, not {len(names)}")
+            rows.append([_number(cells[names.index(c)], c, f"{path}, line {at}") for c in COLUMNS])
+            if len(rows) > MOST_POINTS:
+                raise InputError(f"{path}, line {at}: over {MOST_POINTS} points")
             if not sum(rows[-1][2:]) >= NARROWEST:
-                raise InputError(f"{path}, line {number}: less than {NARROWEST} m wide")
+                raise InputError(f"{path}, line {at}: less than {NARROWEST} m wide")
     return np.array(rows).reshape(-1, len(COLUMNS))
 
 
@@ -84,10 +84,7 @@ def _cells(line: str) -> list[str]:
 
 def _number(cell: str, column: str, where: str) -> float:
     low, high = (0.0, WIDEST) if column.startswith("w_") else (-FARTHEST, FARTHEST)
-    try:
+    value: Any = cell
+    with contextlib.suppress(ValueError):
         value = float(cell)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise InputError(f"{where}: {column} must be a number in [{low:g}, {high:g}], not {cell!r}")
-    return value
+    return number(value, f"{where}: {column}", low, high)

@@ -10,13 +10,24 @@ from typing import Any
 import numpy as np
 
 from countersteer.car.parameter import unknown_key
-from countersteer.course.course import Course, Segment, Turn, from_segments, from_walls
+from countersteer.course.course import (
+    MOST_WALLS,
+    Course,
+    Segment,
+    Turn,
+    from_segments,
+    from_walls,
+)
 from countersteer.errors import InputError
+from countersteer.reading import values
+from countersteer.reading.content import reading
+from countersteer.reading.values import flag, number, short
 from countersteer.text import read_toml
 
 LIBRARY = importlib.resources.files("countersteer.course") / "library"
 
 KEYS = ("name", "width_m", "closed", "crosses", "segments", "walls_m", "start", "goal")
+MOST_SEGMENTS = 500
 MOST_DEG, MOST_MITRED_DEG = 350, 179  # of a turn with a radius, and without
 PLACES = {
     "start": ("distance_m", "offset_m", "heading_deg"),
@@ -35,6 +46,11 @@ def load_course(name: str) -> Course:
 
     A `.csv` is a centre line with widths (F1TENTH), a `.yaml` an occupancy map (ROS).
     """
+    with reading(short(name)):
+        return _load(name)
+
+
+def _load(name: str) -> Course:
     path = Path(name)
     # Imported here, as libraries for geometry and images load slowly.
     if path.suffix == ".csv":
@@ -54,27 +70,23 @@ def course_from_tables(tables: dict[str, Any], where: str) -> Course:
     for key in tables:
         if key not in KEYS:
             raise unknown_key(where, key, dict.fromkeys(KEYS))
-    title = tables.get("name", where)
-    if not isinstance(title, str):
-        raise InputError(f"{where}: name must be a text")
+    title = values.name(tables["name"], f"{where}: name") if "name" in tables else where
     if ("segments" in tables) == ("walls_m" in tables):
         raise InputError(f"{where}: give either segments or walls_m")
     if "walls_m" in tables:
         start = _place(tables, "start", where, PLACES["start of walls"])
         return from_walls(title, _walls(tables["walls_m"], where), (start[0], start[1], start[2]))
-    closed = tables.get("closed", False)
-    if not isinstance(closed, bool):
-        raise InputError(f"{where}: closed must be true or false")
+    closed = flag(tables.get("closed", False), f"{where}: closed")
     start = _place(tables, "start", where, PLACES["start"])
     goal = _place(tables, "goal", where, PLACES["goal"])[0] if "goal" in tables else None
-    width = _number(tables.get("width_m"), f"{where}: width_m", 0.05, 100)
+    width = number(tables.get("width_m"), f"{where}: width_m", 0.05, 100)
     segments = tables["segments"]
     if not isinstance(segments, list) or not all(isinstance(s, dict) for s in segments):
         raise InputError(f"{where}: segments must be a list of {{straight_m}} and {{turn_deg}}")
+    if len(segments) > MOST_SEGMENTS:
+        raise InputError(f"{where}: {len(segments)} segments, over {MOST_SEGMENTS}")
     read = [_segment(s, f"{where}: segments[{i}]") for i, s in enumerate(segments)]
-    crosses = tables.get("crosses", False)
-    if not isinstance(crosses, bool):
-        raise InputError(f"{where}: crosses must be true or false")
+    crosses = flag(tables.get("crosses", False), f"{where}: crosses")
     begin = (start[0], start[1], start[2])
     course = from_segments(where, width, closed, read, begin, goal, crosses)
     return dataclasses.replace(course, name=title)  # errors before this line name the file
@@ -83,10 +95,10 @@ def course_from_tables(tables: dict[str, Any], where: str) -> Course:
 def _segment(segment: dict[str, Any], where: str) -> Segment:
     for key, kind in (("straight_m", "straight"), ("length_m", "length")):
         if set(segment) == {key}:
-            return Segment(kind, _number(segment[key], f"{where}.{key}", 0.01, 1e4))
+            return Segment(kind, number(segment[key], f"{where}.{key}", 0.01, 1e4))
     if set(segment) in ({"turn_deg"}, {"turn_deg", "radius_m"}):
-        radius = _number(segment.get("radius_m", 0.0), f"{where}.radius_m", 0, 1e4)
-        angle = _number(segment["turn_deg"], f"{where}.turn_deg", -MOST_DEG, MOST_DEG)
+        radius = number(segment.get("radius_m", 0.0), f"{where}.radius_m", 0, 1e4)
+        angle = number(segment["turn_deg"], f"{where}.turn_deg", -MOST_DEG, MOST_DEG)
         if radius == 0 and abs(angle) > MOST_MITRED_DEG:
             raise InputError(
                 f"{where}: a turn of {angle:g}° needs an arc: write radius_m beside it, or at most "
@@ -107,7 +119,7 @@ def _place(tables: dict[str, Any], key: str, where: str, known: tuple[str, ...])
         if name not in known:
             raise unknown_key(where, f"{key}.{name}", {f"{key}.{k}": 0 for k in known})
     return [
-        _number(table.get(name, 0.0), f"{where}: {key}.{name}", -1e4, 1e4)
+        number(table.get(name, 0.0), f"{where}: {key}.{name}", -1e4, 1e4)
         * (math.pi / 180 if name.endswith("_deg") else 1.0)
         for name in known
     ]
@@ -117,7 +129,7 @@ def _walls(lines: Any, where: str) -> np.ndarray:
     """Wall segments (m, 4) of polylines."""
     if not isinstance(lines, list) or not lines:
         raise InputError(f"{where}: walls_m must be a list of lists of [x, y]")
-    walls = []
+    walls: list[list[float]] = []
     for i, line in enumerate(lines):
         at = f"{where}: walls_m[{i}]"
         if (
@@ -126,15 +138,11 @@ def _walls(lines: Any, where: str) -> np.ndarray:
             or not all(isinstance(p, list) and len(p) == 2 for p in line)
         ):
             raise InputError(f"{at} must hold two or more points [x, y]")
-        points = [[_number(c, at, -1e5, 1e5) for c in p] for p in line]
+        if len(walls) + len(line) > MOST_WALLS:
+            raise InputError(f"{where}: walls_m has over {MOST_WALLS} pieces of wall")
+        points = [[number(c, at, -1e5, 1e5) for c in p] for p in line]
         walls.extend([[*a, *b] for a, b in itertools.pairwise(points)])
     return np.array(walls)
-
-
-def _number(value: Any, where: str, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise InputError(f"{where} must be a number in [{low:g}, {high:g}], not {value!r}")
-    return float(value)
 
 
 def course_tables(course: Course) -> dict[str, Any]:

@@ -1,26 +1,26 @@
 """Courses from occupancy maps: the YAML files of ROS's map_server, each beside its image."""
 
 import math
-import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import contourpy
 import numpy as np
 import shapely
-import yaml
-from PIL import Image
 from scipy import ndimage
 
 from countersteer.course.course import Course, from_track, from_walls, walls_around
 from countersteer.errors import InputError
+from countersteer.reading.content import read_text
+from countersteer.reading.documents import LARGEST_YAML, yaml_mapping
+from countersteer.reading.images import read_pixels
+from countersteer.reading.values import number, shown
+from countersteer.reading.values import path as checked_path
 
 TOLERANCE = 0.02  # m, largest distance of walls from the edge between pixels, ...
 PIXELS = 1.0  # ... or so many pixels, if that is more: a slanted edge is a staircase
 SPECK = 4  # pixels: a smaller patch within free space is noise, not a wall
 SMOOTH = 4.0  # pixels: standard deviation of the filter along a centre line
-MOST_PIXELS = 40_000_000
-FORMATS = ("PNG", "PPM", "BMP", "JPEG")
 FREE_THRESH = 0.25  # default, that of ROS 2
 AROUND = np.ones((3, 3))  # pixels of walls connect at corners too, free pixels at edges only
 
@@ -59,7 +59,7 @@ def read_map(path: Path) -> Course:
     the origin, heading 0. Raises `InputError` naming file and key.
     """
     about = _about(path)
-    grid, image = _grid(about, path), path.parent / str(about.get("image"))
+    grid, image = _grid(about, path), path.parent / checked_path(about["image"], f"{path}: image")
     free = _free(about, path, image)
     if not np.any(free):
         raise InputError(f"{path}: {image.name} has no free pixel")
@@ -90,18 +90,7 @@ def read_map(path: Path) -> Course:
 
 
 def _about(path: Path) -> dict[str, Any]:
-    try:
-        about = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    except RecursionError:
-        raise InputError(f"{path}: not valid YAML: too deep") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: cannot be read: it is not text") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    if not isinstance(about, dict):
-        raise InputError(f"{path}: not a map: it has no keys")
+    about = yaml_mapping(read_text(path, LARGEST_YAML), str(path))
     for key in ("image", "resolution", "origin"):
         if key not in about:
             raise InputError(f"{path}: {key} is missing")
@@ -112,24 +101,14 @@ def _grid(about: dict[str, Any], path: Path) -> Grid:
     origin = about["origin"]
     if not isinstance(origin, list) or len(origin) != 3:
         raise InputError(f"{path}: origin must be [x, y, yaw] in metres and radians")
-    x, y, yaw = (_number(value, f"{path}: origin", -1e5, 1e5) for value in origin)
-    return Grid(_number(about["resolution"], f"{path}: resolution", 1e-4, 10), x, y, yaw)
-
-
-def _number(value: Any, where: str, low: float, high: float) -> float:
-    try:
-        read = math.nan if isinstance(value, bool) else float(value)  # YAML reads 5e-2 as text
-    except (TypeError, ValueError):
-        read = math.nan
-    if not low <= read <= high:
-        raise InputError(f"{where} must be a number in [{low:g}, {high:g}], not {value!r}")
-    return read
+    x, y, yaw = (number(value, f"{path}: origin", -1e5, 1e5) for value in origin)
+    return Grid(number(about["resolution"], f"{path}: resolution", 1e-4, 10), x, y, yaw)
 
 
 def _flag(about: dict[str, Any], key: str, path: Path) -> bool:
     value = about.get(key, False)
     if value not in (0, 1):
-        raise InputError(f"{path}: {key} must be true or false, not {value!r}")
+        raise InputError(f"{path}: {key} must be true or false, not {shown(value)}")
     return bool(value)
 
 
@@ -137,30 +116,9 @@ def _free(about: dict[str, Any], path: Path, image: Path) -> np.ndarray:
     """Mask of free pixels, lowest row first: their occupancy is below `free_thresh`."""
     mode = about.get("mode", "trinary")
     if mode not in ("trinary", "scale", "raw"):
-        raise InputError(f"{path}: mode must be trinary, scale or raw, not {mode!r}")
-    threshold = _number(about.get("free_thresh", FREE_THRESH), f"{path}: free_thresh", 0, 1)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # we have our own limit
-            opened = Image.open(image, formats=FORMATS)
-        with opened:
-            width, height = opened.size
-            if width * height > MOST_PIXELS:
-                raise InputError(
-                    f"{path}: {image.name} has {width} × {height} pixels, over {MOST_PIXELS}"
-                )
-            if opened.mode.startswith("I"):  # 16 bits
-                shade, opaque = np.asarray(opened) / 257, np.ones((height, width), bool)
-            else:
-                channels = np.asarray(opened.convert("RGBA"))
-                shade, opaque = np.mean(channels[..., :3], axis=-1), channels[..., 3] > 0
-    except Image.DecompressionBombError:
-        raise InputError(f"{path}: {image.name} has over {MOST_PIXELS} pixels") from None
-    except (OSError, ValueError, SyntaxError) as error:
-        reason = error.strerror if isinstance(error, OSError) else None
-        raise InputError(
-            f"{path}: image {image}: {reason or 'no picture that can be read'}"
-        ) from None
+        raise InputError(f"{path}: mode must be trinary, scale or raw, not {shown(mode)}")
+    threshold = number(about.get("free_thresh", FREE_THRESH), f"{path}: free_thresh", 0, 1)
+    shade, opaque = read_pixels(image)
     if mode == "raw":
         occupied = shade / 100  # per cent; from 101 on unknown
     else:

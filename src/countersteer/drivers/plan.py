@@ -26,6 +26,9 @@ from countersteer.drivers.pursuit import pursued
 from countersteer.drivers.straighten import Straighten
 from countersteer.errors import InputError
 from countersteer.estimation import spikes
+from countersteer.reading.content import reading
+from countersteer.reading.values import number, shown
+from countersteer.reading.values import path as checked_path
 from countersteer.signals import Array, Command, Scalar
 from countersteer.text import read_toml
 
@@ -277,6 +280,7 @@ TAKES: dict[str, dict[str, Key]] = {
     "curve": {"speed_mps": Key(0.1, 20)},
 }
 LEAST_DRIFT = 20  # degrees
+MOST_POLICIES = 1000
 Read = Callable[[Path], Mapping[str, np.ndarray]]  # a commands.csv as time_s, throttle, steering
 
 
@@ -300,15 +304,20 @@ def plan(
     for key in tables:
         if key not in known:
             raise unknown_key(where, key, dict.fromkeys(known))
+    if not isinstance(tables.get("description", ""), str):
+        raise InputError(f"{where}: description must be a text")
     rows = tables.get("policy")
     if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(f"{where}: a plan needs [[policy]] tables")
+    if len(rows) > MOST_POLICIES:
+        raise InputError(f"{where}: {len(rows)} policies, over {MOST_POLICIES}")
     speed = drift_turn.SPEED if speed is None else speed
     length = course.length
-    read_rows = [
-        _policy(row, f"{where}: policy {number}", speed, length, Path(where).parent, read)
-        for number, row in enumerate(rows, start=1)
-    ]
+    with reading(where):
+        read_rows = [
+            _policy(row, f"{where}: policy {at}", speed, length, Path(where).parent, read)
+            for at, row in enumerate(rows, start=1)
+        ]
     most = max(len(row.times) for row in read_rows)
     padded = [
         row._replace(
@@ -343,8 +352,8 @@ def _policy(
 ) -> Policies:
     """One policy from its table. `where` names file and policy; `folder` is the file's."""
     does = row.get("does")
-    if does not in NAMES:
-        raise InputError(f"{where}: does must be one of {', '.join(NAMES)}, not {does!r}")
+    if not isinstance(does, str) or does not in NAMES:
+        raise InputError(f"{where}: does must be one of {', '.join(NAMES)}, not {shown(does)}")
     takes = TAKES[does] | ANYWHERE
     others = {"does": 0, "until": 0} | ({"commands": 0} if does == "commands" else {})
     for key in row:
@@ -363,7 +372,7 @@ def _policy(
             if key in table and table[key] > length:
                 raise InputError(
                     f"{where}: {name}{key} must be on the course, in [0, {length:g}], "
-                    f"not {table[key]!r}"
+                    f"not {shown(table[key])}"
                 )
     if ("from_m" in row) != ("to_m" in row):
         raise InputError(f"{where}: from_m and to_m go together")
@@ -378,9 +387,7 @@ def _policy(
             throttle = np.array([numbers["throttle"]])
             steering = np.array([numbers["steering_deg"]])
         else:
-            if not isinstance(row["commands"], str):
-                raise InputError(f"{where}: commands must be the path of a commands.csv")
-            played = read(folder / row["commands"])
+            played = read(folder / checked_path(row["commands"], f"{where}: commands"))
             times = np.asarray(played["time_s"]) - played["time_s"][0]
             throttle, steering = np.asarray(played["throttle"]), np.asarray(played["steering"])
     return Policies(
@@ -400,10 +407,4 @@ def _number(table: dict[str, Any], key: str, span: Key, where: str, path: str = 
     """A number in SI units, or `span.never` if the key is absent."""
     if key not in table:
         return span.never
-    value = table[key]
-    bad = isinstance(value, bool) or not isinstance(value, int | float)
-    if bad or not span.low <= value <= span.high:
-        raise InputError(
-            f"{where}: {path}{key} must be a number in [{span.low:g}, {span.high:g}], not {value!r}"
-        )
-    return float(value) * span.unit
+    return number(table[key], f"{where}: {path}{key}", span.low, span.high) * span.unit

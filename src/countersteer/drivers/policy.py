@@ -28,6 +28,9 @@ from countersteer.car.parameter import EDGE, Declaration, read_value, unknown_ke
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
+from countersteer.reading import values
+from countersteer.reading.content import reading
+from countersteer.reading.values import short, shown
 from countersteer.text import read_toml, toml_of
 from countersteer.writing import write_whole
 
@@ -105,7 +108,8 @@ class Policy(NamedTuple):
 
 def load_policy(name: str) -> Policy:
     """A policy from the library or a file. Raises `InputError` naming file, key and range."""
-    return policy_of_tables(*read_toml(name, LIBRARY, "policy"))
+    with reading(short(name)):
+        return policy_of_tables(*read_toml(name, LIBRARY, "policy"))
 
 
 def policy_of_tables(tables: Mapping[str, Any], where: str) -> Policy:
@@ -115,7 +119,16 @@ def policy_of_tables(tables: Mapping[str, Any], where: str) -> Policy:
         if key not in known:
             raise unknown_key(where, key, known)
     if tables.get("kind") != KIND:
-        raise InputError(f'{where}: kind must be "{KIND}", not {tables.get("kind")!r}')
+        raise InputError(f'{where}: kind must be "{KIND}", not {shown(tables.get("kind"))}')
+    texts = {"description": tables.get("description", "")}
+    source = tables.get("source", {})
+    if not isinstance(source, dict):
+        raise InputError(f"{where}: [source] must be a table of texts")
+    for key, value in (texts | {f"source.{k}": v for k, v in source.items()}).items():
+        if not isinstance(value, str):
+            raise InputError(f"{where}: {short(key)} must be a text, not {shown(value)}")
+    if "car" in tables:
+        values.name(tables["car"], f"{where}: car")
     if not set(TABLES) & set(tables):
         raise InputError(f"{where}: holds no number: give {' or '.join(f'[{t}]' for t in TABLES)}")
     read = {part: _read(where, part, tables[part]) for part in TABLES if part in tables}
@@ -137,7 +150,7 @@ def _read(where: str, part: str, table: Any) -> Any:
     for key in table:
         if key not in names:
             raise unknown_key(where, f"{part}.{key}", {f"{part}.{k}": 0 for k in names})
-    values: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     optional = {f.name for f in dataclasses.fields(made) if f.default is not dataclasses.MISSING}
     for field, entry in entries.items():
         key = f"{part}.{entry.name}"
@@ -147,19 +160,19 @@ def _read(where: str, part: str, table: Any) -> Any:
             raise InputError(f"{where}: {key} is missing")
         value = table[entry.name]
         if not entry.by_speed:
-            values[field] = read_value(where, key, entry.declared, value)
+            found[field] = read_value(where, key, entry.declared, value)
             continue
         if not isinstance(value, list) or not 1 <= len(value) <= MOST_SPEEDS:
             raise InputError(f"{where}: {key} must be a list of 1 to {MOST_SPEEDS} numbers")
-        values[field] = np.array(
+        found[field] = np.array(
             [read_value(where, f"{key}[{i}]", entry.declared, v) for i, v in enumerate(value)]
         )
-        if len(value) != len(values["speeds"]):
-            count = len(values["speeds"])
+        if len(value) != len(found["speeds"]):
+            count = len(found["speeds"])
             raise InputError(f"{where}: {key} must hold {count} numbers, as {part}.speed_mps does")
-    if np.any(np.diff(values["speeds"]) <= 0):
+    if np.any(np.diff(found["speeds"]) <= 0):
         raise InputError(f"{where}: {part}.speed_mps must rise")
-    return made(**values)
+    return made(**found)
 
 
 def policy_tables(

@@ -16,7 +16,10 @@ from countersteer.drivers.pursuit import pursuit
 from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
+from countersteer.reading.values import short, shown
 from countersteer.text import nearest, read_toml
+
+KINDS = (policy.KIND, "plan")  # of a file
 
 
 def make_driver(
@@ -45,12 +48,15 @@ def make_driver(
         tables = {"kind": name, **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
-        tables = {"kind": str(numbers.get("kind")), "file": where, **tables, "numbers": numbers}
+        kind = numbers.get("kind")
+        if kind not in KINDS:
+            raise InputError(f"{where}: kind must be one of {', '.join(KINDS)}, not {shown(kind)}")
+        tables = {"kind": kind, "file": where, **tables, "numbers": numbers}
     else:
         known = [*DRIVERS, *plan.library(), *own.installed()]
         raise InputError(
-            f"no driver {name}{nearest(name, known)}: give one of {', '.join(known)}, a policy or "
-            "plan .toml, a commands.csv, or FILE.py:CLASS"
+            f"no driver {short(name)}{nearest(name, known)}: give one of {', '.join(known)}, a "
+            "policy or plan .toml, a commands.csv, or FILE.py:CLASS"
         )
     return driver_of_tables(tables, course, car, laps, read), tables
 
@@ -67,9 +73,9 @@ def driver_of_tables(
         return straighten(course, car, speed)
     if kind == "pursuit":
         return pursuit(course, car, speed)
-    if numbers:
+    if kind == policy.KIND and numbers:
         return drift_turn(course, car, speed, laps, *policy.policy_of_tables(numbers, where))
-    raise InputError(f"{where}: no driver of kind {kind!r} can be made from plain data")
+    raise InputError(f"{short(where)}: no driver of kind {shown(kind)} can be made from plain data")
 
 
 def replay(commands: Mapping[str, np.ndarray]) -> Replay:

@@ -159,7 +159,15 @@ class Straighten:
 def straighten(
     course: Course, car: Car, speed: float | None = None, by: str = "filter", laps: int = 1
 ) -> Straighten:
-    """For a course and a nominal car; `speed` in m/s. Raises `InputError` without side sonars."""
+    """For a course and a nominal car; `speed` in m/s.
+
+    Raises `InputError` without side sonars, and for free walls.
+    """
+    if not len(course.line):
+        raise InputError(
+            f"{course.name}: free walls have no centre line for the driver to follow: give a "
+            "commands.csv, or a course with segments"
+        )
     speed = SPEED if speed is None else speed
     mount_number(car, "left"), mount_number(car, "right")
     return Straighten(

@@ -18,6 +18,7 @@ from countersteer.car.car import Car
 from countersteer.drivers.open_turn import open_turn
 from countersteer.drivers.turning import Turning
 from countersteer.errors import InputError
+from countersteer.reading.content import reading
 from countersteer.runs.files import Table, csv_text, read_table
 from countersteer.runs.run import Run, drawn_car, read_run
 from countersteer.task.turns import sideslip
@@ -245,11 +246,14 @@ def read_turns(path: Path) -> Table:
 
     Raises `InputError` if a number is missing or impossible for a stop.
     """
-    if path.is_dir() and (path / "run.toml").exists():
+    with reading(path):
+        is_folder = path.is_dir()
+        file = path / "turns.csv" if is_folder else path
+        is_run = is_folder and (path / "run.toml").exists()
+        if not is_run and not file.exists():
+            raise InputError(f"{path}: no such table of turns, nor a run's folder")
+    if is_run:
         return as_table(of_run(path))
-    file = path / "turns.csv" if path.is_dir() else path
-    if not file.exists():
-        raise InputError(f"{path}: no such table of turns, nor a run's folder")
     table = read_table(file, COLUMNS[:6], text=WORDS)
     other = ~np.isin(table["hand"], ("left", "right"))
     if np.any(other):
@@ -270,6 +274,8 @@ def draw_turns(table: Table, path: Path, title: str) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    speeds = table["kill_speed_mps"]
+    slowest, fastest = (float(np.min(speeds)), float(np.max(speeds))) if len(speeds) else (0.0, 1.0)
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharex=True)
     for ax, name, label in (
         (axes[0], "time_to_stop_s", "time to stop, s"),
@@ -281,8 +287,8 @@ def draw_turns(table: Table, path: Path, title: str) -> None:
                 table["kill_yaw_rate_degps"][mine],
                 table[name][mine],
                 c=table["kill_speed_mps"][mine],
-                vmin=float(np.min(table["kill_speed_mps"], initial=9.0)),
-                vmax=float(np.max(table["kill_speed_mps"], initial=0.0)),
+                vmin=slowest,
+                vmax=fastest,
                 s=14,
                 marker=marker,
                 linewidths=0,

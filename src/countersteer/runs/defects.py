@@ -16,7 +16,7 @@ from scipy.ndimage import median_filter
 from countersteer.car.car import GRAVITY
 from countersteer.errors import InputError
 from countersteer.runs.files import Table
-from countersteer.runs.run import Run
+from countersteer.runs.run import Run, refuse_long
 
 # Clocks
 MISSED = 5.0  # periods between two rows that make a gap; every log has one or two late rows
@@ -312,7 +312,8 @@ def follow(truth: Table) -> Track | None:
     if {"vx_mps", "vy_mps", "yaw_rate_radps"} <= truth.keys():
         inside = np.isin(truth["time_s"], time)
         inside[1:] &= np.diff(truth["time_s"]) > 0
-        vx, vy, rate = (truth[n][inside] for n in ("vx_mps", "vy_mps", "yaw_rate_radps"))
+        told = (truth[n][inside] for n in ("vx_mps", "vy_mps", "yaw_rate_radps"))
+        vx, vy, rate = (np.where(np.isfinite(v), v, math.nan) for v in told)
         cosine, sine = np.cos(heading), np.sin(heading)
         east, north = cosine * vx - sine * vy, sine * vx + cosine * vy
         return Track(time, east, north, vx, vy, rate, SPAN_OF_VELOCITIES)
@@ -405,7 +406,7 @@ def _merged_hits(
 
 def held(time: np.ndarray, values: np.ndarray, least: float) -> Iterator[tuple[int, int]]:
     """First and last index of each stretch of equal readings of at least `least` seconds."""
-    for first, last in stretches(np.diff(values) == 0):
+    for first, last in stretches(values[1:] == values[:-1]):
         if time[last + 1] - time[first] >= least and last + 2 - first >= READINGS:
             yield first, last + 1
 
@@ -491,6 +492,7 @@ def stuck_gyroscope(run: Run, track: Track | None) -> Iterator[LogDefect]:
 
 def refuse(run: Run) -> None:
     """Raise `InputError` with file and time for errors that masking a stretch cannot remove."""
+    refuse_long(run)
     for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
         if table is not None:
             _refuse_table(f"{run.path}/{name}.csv", table)

@@ -4,20 +4,25 @@ import csv
 import io
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
 
 from countersteer.errors import InputError
-from countersteer.text import read_text
+from countersteer.reading.content import read_text, reading
+from countersteer.reading.values import short, shown
 from countersteer.writing import naming, write_whole
 
 log = logging.getLogger(__name__)
 
 COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
 LARGEST_STEERING = 90.0  # degrees
+LATEST = 1e6  # s, of a time; a clock of Unix time is beyond
+LONGEST = 3600.0  # s, of what is simulated on the commands of a log
+LARGEST = 1e20  # of a finite cell of a run; sums of squares of larger ones leave the floats
+MOST_COLUMNS = 10_000
 
 
 class Table(dict[str, np.ndarray]):
@@ -38,19 +43,28 @@ def read_table(
     that does not end. Raises `InputError` if a column is missing or appears twice; and, with the
     line, for a wrong number of cells, a cell that is no number, or a falling time.
     """
+    with reading(path):
+        return _read_table(path, required, text, recorded)
+
+
+def _read_table(path: Path, required: Iterable[str], text: Sequence[str], recorded: bool) -> Table:
     content = read_text(path)
     lines = content.splitlines()
+    while lines and not lines[-1].strip():
+        lines.pop()
     whole = content.endswith("\n") or len(lines) < 2
     if not whole and (recorded or lines[-1].count(",") < lines[0].count(",")):
         log.warning("%s: its last line, cut off in the middle, is passed over", path)
         lines = lines[:-1]
-    rows = csv.reader(lines)
+    rows = _cells(path, lines)
     header = next(rows, [])
     missing = [name for name in required if name not in header]
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing")
     if len(set(header)) != len(header):
         raise InputError(f"{path}: a column is there twice")
+    if len(header) > MOST_COLUMNS:
+        raise InputError(f"{path}: {len(header)} columns, over {MOST_COLUMNS}")
     columns: list[list[float]] = [[] for _ in header]
     words: list[list[str]] = [[] for _ in header]
     for number, row in enumerate(rows, start=2):
@@ -64,7 +78,7 @@ def read_table(
                 columns[i].append(float(cell) if cell else math.nan)
             except ValueError:
                 raise InputError(
-                    f"{path}, line {number}: {name} must be a number, not {cell!r}"
+                    f"{path}, line {number}: {short(name)} must be a number, not {shown(cell)}"
                 ) from None
     table = Table(
         {name: np.array(words[i] if name in text else columns[i]) for i, name in enumerate(header)}
@@ -73,15 +87,45 @@ def read_table(
         time = table["time_s"]
         if not np.all(np.isfinite(time)):
             raise InputError(f"{path}, line {_first(~np.isfinite(time))}: time_s is not a number")
+        if np.any(np.abs(time) > LATEST):
+            line, first = _first(np.abs(time) > LATEST), time[np.argmax(np.abs(time) > LATEST)]
+            raise InputError(
+                f"{path}, line {line}: time_s must be within {LATEST:g} s of 0, not {first:.10g}: "
+                "if it is Unix time, subtract the time at which the log begins from all its tables"
+            )
         if np.any(np.diff(time) < 0):
             line = _first(np.diff(time) < 0) + 1
             raise InputError(f"{path}, line {line}: time_s goes backwards")
     return table
 
 
+def _cells(path: Path, lines: list[str]) -> Iterator[list[str]]:
+    """The rows of a CSV file. Raises `InputError` if it is none."""
+    try:
+        yield from csv.reader(lines)
+    except csv.Error as error:
+        raise InputError(f"{path}: it is no CSV file: {short(str(error))}") from None
+
+
 def _first(where: np.ndarray) -> int:
     """The line in the file of the first row for which `where` is true."""
     return int(np.argmax(where)) + 2
+
+
+def read_measurements(path: Path, required: Iterable[str], recorded: bool = False) -> Table:
+    """Read a table of a run. Raises `InputError` for a finite number beyond `LARGEST` too.
+
+    `recorded` is as in `read_table`.
+    """
+    table = read_table(path, required, recorded=recorded)
+    for name, column in table.items():
+        beyond = np.isfinite(column) & (np.abs(column) > LARGEST)
+        if np.any(beyond):
+            raise InputError(
+                f"{path}, line {_first(beyond)}: {short(name)} must be in "
+                f"[-{LARGEST:g}, {LARGEST:g}], not {column[np.argmax(beyond)]:g}"
+            )
+    return table
 
 
 def read_commands(path: Path, recorded: bool = False) -> Table:
@@ -92,7 +136,7 @@ def read_commands(path: Path, recorded: bool = False) -> Table:
     table = read_table(path, COMMANDS, text=("direction",), recorded=recorded)
     for name in table:
         if name not in COMMANDS:
-            raise InputError(f"{path}: unknown column {name}; known: {', '.join(COMMANDS)}")
+            raise InputError(f"{path}: unknown column {short(name)}; known: {', '.join(COMMANDS)}")
     if not len(table):
         raise InputError(f"{path}: holds no command")
     throttle, steering = table["throttle"], table["steering_deg"]

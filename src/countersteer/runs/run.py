@@ -1,7 +1,6 @@
 """`Run`: the record of one drive, read from its folder."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,13 @@ import numpy as np
 from countersteer.car.car import Car
 from countersteer.car.files import car_from_tables, library, load_car
 from countersteer.errors import InputError
-from countersteer.runs.files import Table, read_commands, read_table
-from countersteer.text import read_text, tables_of
+from countersteer.reading.content import read_text, reading
+from countersteer.reading.documents import json_object, toml
+from countersteer.runs.files import LONGEST, Table, read_commands, read_measurements
+from countersteer.runs.keys import check_about, check_summary
+from countersteer.text import checked_format
+
+LARGEST = 10  # MB, of run.toml and summary.json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,32 +63,52 @@ def drawn_car(about: Mapping[str, Any]) -> Car:
     return load_car(name if name in library() else "rx7")
 
 
+def refuse_long(run: Run) -> None:
+    """Raise `InputError` for a run of over `LONGEST`, which would be simulated at each instant."""
+    for name, table in (
+        ("commands", run.commands), ("telemetry", run.telemetry), ("truth", run.truth),
+    ):  # fmt: skip
+        if table is not None and len(table) and table["time_s"][-1] > LONGEST:
+            last = f"{table['time_s'][-1]:g} s, over {LONGEST:g} s"
+            raise InputError(f"{run.path}/{name}.csv: goes on to {last}: cut the log into pieces")
+
+
 def read_summary(path: Path) -> dict[str, Any]:
     """Read a `summary.json`. Raises `InputError` if it is not one."""
-    try:
-        found = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from None
-    if not isinstance(found, dict):
-        raise InputError(f"{path}: must hold one JSON object")
+    found = json_object(read_text(path, LARGEST), str(path))
+    check_summary(found, str(path))
     return found
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """Read a `run.toml`. Raises `InputError`, with the key, if one that is used is wrong."""
+    tables = toml(read_text(path, LARGEST), str(path))
+    if isinstance(tables.get("format"), str):  # the first importers named the log's format so
+        tables["log_format"] = tables.pop("format")
+    about = checked_format(tables, str(path))
+    check_about(about, str(path))
+    return about
 
 
 def read_run(path: Path) -> Run:
     """Read a run's folder. Raises `InputError` if it is not one."""
-    if not path.is_dir():
-        raise InputError(f"{path}: no such run folder")
-    if not (path / "run.toml").exists():
-        raise InputError(f"{path}: not a run: it has no run.toml")
-    about = tables_of(read_text(path / "run.toml"), f"{path}/run.toml")
+    with reading(path):
+        if not path.is_dir():
+            raise InputError(f"{path}: no such run folder")
+        if not (path / "run.toml").exists():
+            raise InputError(f"{path}: not a run: it has no run.toml")
+        return _read(path)
+
+
+def _read(path: Path) -> Run:
     recorded = (path / "run.mcap").exists()  # no table that was written by hand
     telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
     return Run(
         path,
-        about,
+        read_about(path / "run.toml"),
         read_commands(path / "commands.csv", recorded),
-        read_table(telemetry, ("time_s",), recorded=recorded) if telemetry.exists() else None,
-        read_table(truth, ("time_s", "x_m", "y_m", "heading_rad"), recorded=recorded)
+        read_measurements(telemetry, ("time_s",), recorded) if telemetry.exists() else None,
+        read_measurements(truth, ("time_s", "x_m", "y_m", "heading_rad"), recorded)
         if truth.exists()
         else None,
         read_summary(summary) if summary.exists() else {},

@@ -12,6 +12,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.errors import InputError
 from countersteer.random_streams import Stream
+from countersteer.reading.values import shown
 from countersteer.sensing.all_sensors import channels
 from countersteer.signals import Array, Channel, Reading, Readings, Scalar, flat, pairs, unflat
 
@@ -100,11 +101,13 @@ def read_fault(text: str) -> SensorFault:
         start, duration = map(float, window)
     except ValueError:
         raise InputError(
-            f"--fault {text!r}: write SENSOR KIND START DURATION (s), such as "
+            f"--fault {shown(text)}: write SENSOR KIND START DURATION (s), such as "
             "'gyroscope stuck 2.0 0.5'"
         ) from None
     if not (0 <= start <= 1e6 and duration > 0):
-        raise InputError(f"--fault {text!r}: START must be in [0, 1e+06] s, DURATION above 0 s")
+        raise InputError(
+            f"--fault {shown(text)}: START must be in [0, 1e+06] s, DURATION above 0 s"
+        )
     return SensorFault(sensor=sensor, kind=kind, start=start, duration=duration)
 
 

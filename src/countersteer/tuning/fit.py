@@ -688,19 +688,31 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
     return deviation, determined
 
 
+def halves(run: np.ndarray) -> np.ndarray:
+    """The half of each window, 0 or 1: (windows,). `run` is the index of its log.
+
+    Windows in the order of their logs are cut into eighths. The even eighths are one half, the odd
+    ones the other. Fewer than eight windows go to the halves by turns.
+    """
+    rank = np.argsort(np.argsort(run, kind="stable"))
+    pieces = min(8, len(rank))
+    return np.asarray(rank * pieces // len(rank) % 2)
+
+
 def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Half the difference between fits to two halves of the data: (parameters,).
 
-    Windows in the order of their logs are cut into eighths. The even eighths are one half, the odd
-    ones the other. The result is 0 for a parameter whose surface or log is in one half only.
+    The result is 0 for a parameter whose surface or log is in one half only, and for all
+    parameters with a single window.
     """
-    rank = np.argsort(np.argsort(whole.shots.run, kind="stable"))
-    eighth = rank * 8 // len(rank)
+    half_of = halves(whole.shots.run)
+    if len(half_of) < 2:
+        return np.zeros(len(u))
     ends, in_both = np.tile(u, (2, 1)), np.full(len(u), True)
     for half, end in enumerate(ends):
         problem = Problem(
             whole.cars,
-            select(whole.shots, eighth % 2 == half),
+            select(whole.shots, half_of == half),
             list(dict.fromkeys(p.path for p in whole.parameters)),
             charge=whole.charge_at(u),
         )

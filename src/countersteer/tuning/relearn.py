@@ -69,7 +69,12 @@ def pieces_of_time(run_of: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def optimism(cars: dict[str, Car], shots: Shots, piece: np.ndarray, free: tuple[str, ...]) -> float:
-    """Mean e with the car fitted to the other half of the pieces, less that with its own; >= 0."""
+    """Mean e with the car fitted to the other half of the pieces, less that with its own; >= 0.
+
+    Raises `InputError` if a half has no window.
+    """
+    if len(np.unique(piece % 2)) < 2:
+        raise InputError("--new: too few windows of the old runs tell of what is fitted")
     cars_of = []
     for half in (0, 1):
         problem = fit.Problem(cars, fit.select(shots, piece % 2 == half), free)

@@ -145,15 +145,24 @@ READERS: dict[str, Callable[[Run], Speed]] = {
 
 
 def _reported(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
-    time, values = readings(run, name)
+    time, values = _readings(run, name)
     if len(time) < 2:
         raise InputError(f"{run.path}/telemetry.csv: {name} is not there, or holds no two readings")
     return time, values
 
 
+def _readings(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """`readings` at rising times: of equal times, the first counts. Infinite ones are echoes."""
+    time, values = readings(run, name)
+    if not name.startswith("sonar"):
+        time, values = time[np.isfinite(values)], values[np.isfinite(values)]
+    time, rows = np.unique(time, return_index=True)
+    return time, values[rows]
+
+
 def _quantum(run: Run, speed: np.ndarray) -> float:
     """Speed of one count in a window (m/s)."""
-    counts = readings(run, "encoder_counts")[1]
+    counts = _readings(run, "encoder_counts")[1]
     passed = np.diff(counts) if len(counts) == len(speed) else np.zeros(len(speed) - 1)
     told = (passed > 0) & (speed[1:] > 0)  # one of the two columns may be stuck
     if np.any(told):
@@ -173,7 +182,7 @@ def _windows(
         inside = (time >= start - 1e-9) & (time < start + WINDOW - 1e-9)
         least = max(FEWEST, np.sum(inside) / 2)
         inside &= np.isfinite(distance)
-        if np.sum(inside) >= least:
+        if np.sum(inside) >= least and np.ptp(time[inside]) > WINDOW / 4:
             yield time[inside], distance[inside], float(least)
 
 

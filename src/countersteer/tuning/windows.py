@@ -15,20 +15,23 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from countersteer.car.car import Car
+from countersteer.errors import InputError
 from countersteer.runs.defects import stretches
 from countersteer.runs.files import Table
-from countersteer.runs.run import Run
+from countersteer.runs.run import Run, refuse_long
 from countersteer.signals import Command, Motion, Scalar, Wheels
 from countersteer.world import motor, planar, servo
 from countersteer.world.chassis import Vector, dot
 from countersteer.world.state import State
 
 QUANTITIES = ("vx_mps", "vy_mps", "yaw_rate_radps", "wheel_speed_mps")
+VELOCITY = QUANTITIES[:3]  # of the body
 CHANGES = {"vx_mps": 0.3, "vy_mps": 0.3, "yaw_rate_radps": 1.0}  # beyond, a window is transient
 EVERY = 0.25  # s between the starts of windows
 SLOWEST = 0.2  # m/s, least speed at the start of a window
 
 SMOOTHED_OVER, DEGREE = 0.15, 3  # s, width of the Savitzky-Golay filter, and its degree
+MOST_POSES = 10_000_000  # after resampling
 GAP = 0.035  # s; longer gaps of motion capture are not interpolated
 
 PIECE = 100  # ticks in each call of the compiled program, for any horizon
@@ -97,22 +100,24 @@ class Reference(NamedTuple):
 
 
 def read_measured(run: Run, car: Car) -> Measured:
-    """Body velocities, wheel speeds and sensor readings of a run."""
+    """Body velocities, wheel speeds and sensor readings of a run.
+
+    Raises `InputError` if the run is too long, or its poses are too close in time.
+    """
+    refuse_long(run)
     vx = vy = yaw_rate = wheels = None
     truth = run.truth
     if truth is not None and len(truth):
         time = truth["time_s"]
-        if {"vx_mps", "vy_mps", "yaw_rate_radps"} <= truth.keys():
+        if set(VELOCITY) <= truth.keys():
             when = time - float(run.about.get("velocity_lag_s", 0.0))  # measured by the importer
-            vx = Signal(when, truth["vx_mps"])
-            vy = Signal(when, truth["vy_mps"])
-            yaw_rate = Signal(when, truth["yaw_rate_radps"])
+            vx, vy, yaw_rate = (Signal(when, _known(truth[name])) for name in VELOCITY)
         else:
             vx, vy, yaw_rate = velocities(time, truth["x_m"], truth["y_m"], truth["heading_rad"])
         names = [f"wheel_{place}_radps" for place in ("fl", "fr", "rl", "rr")]
         if set(names) <= truth.keys():
             wheels = tuple(
-                Signal(time, radius * truth[name])
+                Signal(time, radius * _known(truth[name]))
                 for radius, name in zip(radii(car), names, strict=True)
             )
     telemetry = run.telemetry if run.telemetry is not None else Table()
@@ -127,6 +132,11 @@ def read_measured(run: Run, car: Car) -> Measured:
         gyro_timing(run),
         _reported(telemetry, "armed"),
     )
+
+
+def _known(values: np.ndarray) -> np.ndarray:
+    """The values; NaN for infinite ones."""
+    return np.where(np.isfinite(values), values, math.nan)
 
 
 def encoder_timing(run: Run, car: Car) -> Timing:
@@ -179,6 +189,8 @@ def velocities(
     if len(time) < 2 or not np.median(np.diff(time)) > 0:
         return none, none, none
     step = float(np.median(np.diff(time)))
+    if (time[-1] - time[0]) / step > MOST_POSES:
+        raise InputError(f"truth.csv: poses are {step:g} s apart: that is no rate of measurement")
     grid = np.arange(time[0], time[-1] + step / 2, step)
     after = np.clip(np.searchsorted(time, grid, side="right"), 1, len(time) - 1)
     known = time[after] - time[after - 1] <= max(GAP, 1.5 * step)
@@ -303,10 +315,11 @@ def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[
 
 
 def _slope(signal: Signal) -> Signal:
-    """The derivative of a signal; 0 for a signal of one sample."""
-    if len(signal.time) < 2:
+    """The derivative of a signal; 0 for one sample. Of equal times, the first counts."""
+    time, rows = np.unique(signal.time, return_index=True)
+    if len(time) < 2:
         return signal._replace(value=0.0 * signal.value)
-    return signal._replace(value=np.gradient(signal.value, signal.time))
+    return Signal(time, np.gradient(signal.value[rows], time))
 
 
 def wheels_at(

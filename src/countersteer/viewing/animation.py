@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 FINE = 3  # drawn pixels for each shown pixel, along each side
 TRAIL_PERIOD = 0.02  # s between two points of the trail
+FARTHEST, LONGEST = 1e6, 36_000.0  # m and rad of a pose, s of a run
 OVERLAP = 25  # points of the old trail that are drawn again with a new piece
 MARGIN = 0.35  # around the scene, in lengths of the car
 FOLLOWED = 9.0  # width of a following camera's view, in lengths of the car
@@ -70,11 +71,16 @@ class Animation:
         if run.truth is None:
             raise InputError(f"{run.path}: has no truth.csv, so there is no path to draw")
         pose = np.column_stack([run.truth[name] for name in ("x_m", "y_m", "heading_rad")])
-        known = np.all(np.isfinite(pose), axis=1)
-        truth = {name: column[known] for name, column in run.truth.items()}
+        known = np.all(np.abs(pose) <= FARTHEST, axis=1)  # false for NaN too
+        truth = {
+            name: np.where(np.abs(column[known]) <= FARTHEST, column[known], math.nan)
+            for name, column in run.truth.items()
+        }
         if np.sum(known) < 2:
             raise InputError(f"{run.path}/truth.csv: holds fewer than two poses")
         self._time, self._pose = truth["time_s"], pose[known]
+        if self._time[-1] - self._time[0] > LONGEST:
+            raise InputError(f"{run.path}: lasts over {LONGEST:g} s, too long to draw")
         self._pose[:, 2] = np.unwrap(self._pose[:, 2])
         begin = max(options.begin, float(self._time[0]))
         end = min(options.end, float(self._time[-1]))
@@ -153,7 +159,7 @@ class Animation:
         wheels = picture.placed(hubs, pose).swapaxes(0, 1)
         colours, marks = [SOFT] * len(time), np.zeros((4, len(time)))
         if slip is not None:
-            end = max(math.radians(20), float(np.nanmax(np.abs(slip))))
+            end = max(math.radians(20), float(np.max(np.nan_to_num(np.abs(slip)))))
             colours = [ramp(part) for part in (np.abs(at(slip)) / end).tolist()]
         names = [f"wheel_{wheel}_radps" for wheel in ("fl", "fr", "rl", "rr")]
         if slip is not None and {"yaw_rate_radps", *names} <= set(truth):

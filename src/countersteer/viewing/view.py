@@ -19,10 +19,12 @@ from countersteer.world import planar
 from countersteer.world.floor import Floor, floor_of_run
 
 PERIOD = 0.01  # s between two samples, at least
+LARGEST = 1e6  # of a number in truth.csv that is drawn
 ROWS = 1024  # in each computation of forces; a fixed number, so that there is one program
 UNJUDGED: dict[str, Any] = {"completed": False, "wall_contacts": None, "turns": []}
 WHEELS = ("fl", "fr", "rl", "rr")
 MOTION = ("vx_mps", "vy_mps", "yaw_rate_radps", "steering_rad")
+COLUMNS = (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS))
 
 
 def view_of(run: Run) -> dict[str, Any]:
@@ -31,18 +33,9 @@ def view_of(run: Run) -> dict[str, Any]:
     Rows that do not say all of the motion are left out. Raises `InputError` if the run has no
     `truth.csv`, or one without a simulated car's columns.
     """
-    if run.truth is None or len(run.truth) == 0:
-        raise InputError(f"{run.path}: has no truth.csv to draw")
-    needed = (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS))
-    for name in needed:
-        if name not in run.truth:
-            raise InputError(f"{run.path}/truth.csv: has no {name}: this page is of simulated runs")
-    shown_columns = ("x_m", "y_m", "heading_rad", *needed)
-    known = np.all(np.isfinite([run.truth[name] for name in shown_columns]), axis=0)
-    if not known.any():
-        raise InputError(f"{run.path}/truth.csv: has no row that says all of the motion")
-    truth = Table({name: column[known] for name, column in run.truth.items()})
-    run, about, car = dataclasses.replace(run, truth=truth), run.about, drawn_car(run.about)
+    run = dataclasses.replace(run, truth=known_rows(run))
+    about, car, truth = run.about, drawn_car(run.about), run.truth
+    assert truth is not None
     time = truth["time_s"]
     period = float(np.median(np.diff(time))) if len(time) > 1 else PERIOD
     every = slice(None, None, max(1, round(PERIOD / max(period, 1e-6))))
@@ -86,6 +79,23 @@ def _unfinished(run: Run, time: np.ndarray) -> dict[str, str]:
     """The verdict on a drive that was recorded up to a time (s) and has no summary."""
     verdict = f"{run.outcome}: the record ends at {time[-1]:.2f} s"
     return {"verdict": verdict} if run.outcome == "not finished" else {}
+
+
+def known_rows(run: Run) -> Table:
+    """The rows of `truth.csv` whose numbers can all be drawn.
+
+    Raises `InputError` without one, or without a column of a simulated run.
+    """
+    if run.truth is None or len(run.truth) == 0:
+        raise InputError(f"{run.path}: has no truth.csv to draw")
+    for name in COLUMNS:
+        if name not in run.truth:
+            raise InputError(f"{run.path}/truth.csv: has no {name}: this page is of simulated runs")
+    drawn = [run.truth[name] for name in ("time_s", "x_m", "y_m", "heading_rad", *COLUMNS)]
+    known = np.all(np.abs(drawn) <= LARGEST, axis=0)  # false for NaN too
+    if not np.any(known):
+        raise InputError(f"{run.path}/truth.csv: holds no row of numbers that can be drawn")
+    return Table({name: column[known] for name, column in run.truth.items()})
 
 
 def warm_up(car: Car, floor: Floor | None = None) -> None:

@@ -9,7 +9,6 @@ Axes and signs need no change (ISO 8855: yaw, yaw rate and steering positive to 
 Source: https://github.com/Lorenzo-Lyons/DART, MIT licence.
 """
 
-import csv
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ from countersteer.errors import InputError
 from countersteer.runs.defects import SLACK, SLACK_YAW
 from countersteer.runs.files import (
     COMMANDS,
+    LATEST,
     Table,
     read_table,
     require,
@@ -60,6 +60,8 @@ ONBOARD = {
 ASKED = ("safety_value", "throttle", "steering")
 CAPTURE = ("vicon time", "vicon x", "vicon y", "vicon yaw")
 CLOCK = "elapsed time sensors"
+CLOCKS = (CLOCK, "vicon time")
+LARGEST, LATEST_CLOCK = 1e6, 1e12  # of a cell, and of a clock: it may be Unix time in ms
 PROCESSED = {"vx body": "vx_mps", "vy body": "vy_mps", "w": "yaw_rate_radps"}
 YAW = "unwrapped yaw"
 
@@ -149,10 +151,7 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
 
 def _read(log: Path) -> Table:
     """Read the columns of a log. Raises `InputError` if it has no rows or is no CSV file."""
-    try:
-        table = read_table(log, ())
-    except csv.Error:
-        raise InputError(f"{log}: not a DART log: it is no CSV file") from None
+    table = read_table(log, ())
     if not table.keys():
         raise InputError(f"{log}: is empty")
     if not len(table):
@@ -271,13 +270,17 @@ def _check(log: Path, table: Table, columns: tuple[str, ...]) -> None:
         if name not in table:
             raise InputError(f"{log}: not a DART log: column '{name}' is missing")
         require(line, np.isfinite(table[name]), f"{name} is not a number")
+        most = LATEST_CLOCK if name in CLOCKS else LARGEST
+        require(line, np.abs(table[name]) <= most, f"{name} must be in [-{most:g}, {most:g}]")
     for name in ("throttle", "steering"):
         require(line, np.abs(table[name]) <= 1, f"{name} must be in [-1, 1]")
 
 
 def _rises(log: Path, table: Table, clock: str) -> None:
     """Raise `InputError` if a clock goes backwards."""
-    require(_line(log), np.diff(table[clock], prepend=-math.inf) >= 0, f"{clock} goes backwards")
+    line, time = _line(log), table[clock]
+    require(line, np.diff(time, prepend=-math.inf) >= 0, f"{clock} goes backwards")
+    require(line, time - time[0] <= LATEST, f"{clock} is over {LATEST:g} s after the first row's")
 
 
 def _line(log: Path) -> Callable[[int], str]:

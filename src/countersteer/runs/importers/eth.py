@@ -9,13 +9,13 @@ before. Axes and signs need no change (ISO 8855). The point is published as the 
 Source: https://github.com/lasgroup/simulation_transfer, MIT licence.
 """
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from countersteer.errors import InputError
+from countersteer.reading.arrays import read_arrays
 from countersteer.runs.files import COMMANDS, require
 from countersteer.runs.recorder import Recorder, whole_folder
 
@@ -30,7 +30,8 @@ PERIOD = 0.0336
 VELOCITY_LAG = 0.015
 
 FASTEST_YAW = 12.0  # rad/s; a higher yaw rate was computed across a wrap of the heading
-LARGEST_FILE = 256  # MB, unpacked
+MOST_ROWS = 1_000_000  # nine hours
+LARGEST = 1e6  # of a number, in its unit
 OBSERVED, ASKED = 12, 2  # columns
 
 
@@ -103,31 +104,25 @@ def _read(log: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises `InputError` if they are not as in the module's description.
     """
-    try:
-        with zipfile.ZipFile(log) as packed:
-            size = sum(entry.file_size for entry in packed.infolist())
-        if size > LARGEST_FILE * 1e6:
-            raise InputError(f"{log}: cannot be read: it holds more than {LARGEST_FILE} MB")
-        with np.load(log) as arrays:
-            missing = [name for name in ("obs", "action") if name not in arrays]
-            if missing:
-                raise InputError(f"{log}: not an ETH log: array '{missing[0]}' is missing")
-            observed, asked = (np.asarray(arrays[name]) for name in ("obs", "action"))
-    except OSError as error:
-        raise InputError(f"{log}: cannot be read: {error.strerror or error}") from None
-    except (zipfile.BadZipFile, ValueError, EOFError, KeyError):
-        raise InputError(f"{log}: not an ETH log: it is no .npz file of numbers") from None
+    found = read_arrays(log, ("obs", "action"), "an ETH log")
+    observed, asked = found["obs"], found["action"]
 
     def place(row: int) -> str:
         return f"{log}, row {row} ({row * PERIOD:.2f} s)"
 
-    for name, array, width in (("obs", observed, OBSERVED), ("action", asked, ASKED)):
+    for name, array, width, most in (
+        ("obs", observed, OBSERVED, LARGEST),
+        ("action", asked, ASKED, 1.0),
+    ):
         if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
             raise InputError(f"{log}: not an ETH log: '{name}' must be numbers (N, {width})")
         require(place, np.all(np.isfinite(array), axis=1), f"{name} is not a number")
+        within = np.all(np.abs(array) <= most, axis=1)
+        require(place, within, f"{name} must be in [-{most:g}, {most:g}]")
     if len(observed) != len(asked) or len(observed) < 2:
         raise InputError(
             f"{log}: 'obs' and 'action' must be as long as each other, two rows or more"
         )
-    require(place, np.all(np.abs(asked) <= 1, axis=1), "action must be in [-1, 1]")
-    return observed.astype(float), asked.astype(float)
+    if len(observed) > MOST_ROWS:
+        raise InputError(f"{log}: {len(observed)} rows, over {MOST_ROWS}")
+    return observed, asked
