@@ -17,6 +17,9 @@ class Vector(NamedTuple):
     yaw: Scalar
 
 
+NONE = Vector(0.0, 0.0, 0.0)
+
+
 def times(*factors: Scalar) -> Scalar:
     """The product. It is 0.0 without computation if a factor is Python's 0.0.
 
@@ -74,18 +77,27 @@ def combine(weight_a: Scalar, a: Vector, weight_b: Scalar, b: Vector) -> Vector:
     )
 
 
-def solve(m: Symmetric, b: Vector) -> Vector:
-    """The solution of m v = b for a positive definite m, by its LDLᵀ factors."""
+def solve(m: Symmetric, b: Vector, least: Vector = NONE) -> Vector:
+    """The solution of m v = b for a positive definite m, by its LDLᵀ factors.
+
+    If m is a diagonal plus squares, no factor is below that diagonal, `least`. Without it, rounding
+    could bring one to 0: contacts can be a million times as stiff as the body is heavy.
+    """
     by_x = 1 / m.xx
     l_yx, l_wx = m.xy * by_x, m.xw * by_x
-    by_y = 1 / (m.yy - l_yx * m.xy)
+    by_y = 1 / _at_least(least.y, m.yy - l_yx * m.xy)
     yw = m.yw - l_yx * m.xw
     l_wy = yw * by_y
-    d_w = m.ww - l_wx * m.xw - l_wy * yw
+    d_w = _at_least(least.yaw, m.ww - l_wx * m.xw - l_wy * yw)
     z_y = b.y - l_yx * b.x
     yaw = (b.yaw - l_wx * b.x - l_wy * z_y) / d_w
     y = z_y * by_y - l_wy * yaw
     return Vector(b.x * by_x - l_yx * y - l_wx * yaw, y, yaw)
+
+
+def _at_least(least: Scalar, value: Scalar) -> Scalar:
+    # Not `maximum`: where the two are equal, it halves the derivative.
+    return jnp.where(value < least, least, value)
 
 
 def wheel_loads(body: Body, ax: Scalar, ay: Scalar) -> Wheels:

@@ -19,9 +19,9 @@ If a contact's slip keeps its direction (`steady`), its force follows the tangen
 Otherwise it follows the chord: -k times the slip at the end of the stage. Chords alone remove
 energy at any step h and any k >= 0: the held system is symmetric, and all its modes are damped.
 Tangents do not guarantee this. So `guarded` compares the kinetic energy at the end of a tick with
-that at its start plus the supply of the motor (or of a Magic Formula's shift). If it is larger,
-only a part of the tick's change is applied, and the next tick uses chords, which always make
-progress. This costs order, but contacts cannot add energy.
+that at its start plus the supply of the motor. If it is larger, only a part of the tick's change
+is applied, and the next tick uses chords, which always make progress. This costs order, but
+contacts cannot add energy.
 
 Source of the method: R. Alexander, SIAM J. Numer. Anal. 14, 1977.
 """
@@ -62,6 +62,7 @@ class Tick(NamedTuple):
     count: Scalar  # ticks since the start, an integer
     dt: float
     floor: Floor | None = None  # None: uniform friction
+    start: Motion | None = None  # at the start of the tick, for `collide`
 
 
 def initial_state(
@@ -127,7 +128,7 @@ def step(
     Throttle is in [-1, 1], steering in rad. Precision is that of the car's leaves. Without a
     `floor`, friction is uniform and costs no computation.
     """
-    tick = Tick(car, around, command, command, count, dt, floor)
+    tick = Tick(car, around, command, command, count, dt, floor, state.motion)
     for stage in STAGES:
         state, tick = stage(state, tick)
     return state
@@ -213,20 +214,20 @@ def guarded(
 ) -> tuple[tuple[Vector, Wheels], Scalar]:
     """The velocities after a tick without a gain of energy, and 1 if they were limited, else 0.
 
-    After a part p of the change d, the energy is E + p g + p² K(d). P is the supplied power. If
-    the whole change gains more than h P, half of p = (h P - g) / K(d) is applied. At that p, the
-    gain equals the supply p h P.
+    Only the motor supplies energy. Its power is P. After a part p of the change d, the energy is
+    E + p g + p² K(d). If the whole change gains more than h P, half of p = (h P - g) / K(d) is
+    applied. At that p, the gain equals the supply p h P.
     """
-    power = pushed_power(held) + jnp.maximum(
-        *(motor_power(car, held.drive, wheels) for _, wheels in (before, after))
-    )
+    power = jnp.maximum(*(motor_power(car, held.drive, wheels) for _, wheels in (before, after)))
     change = jax.tree.map(lambda a, b: a - b, after, before)
     energy, curvature = kinetic_energy(car, *before), kinetic_energy(car, *change)
     gain = kinetic_energy(car, *after) - energy
-    rounding = 4 * jnp.finfo(jnp.result_type(energy)).eps * energy
-    gains = gain > h * power + rounding
+    precision = jnp.finfo(jnp.result_type(energy))
+    # A gain within rounding is none, nor is one that is as good as 0: squares of speeds underflow.
+    gains = gain > h * power + 4 * precision.eps * energy + precision.tiny / precision.eps
     slope = gain - curvature
-    part = jnp.clip((h * power - slope) / (2 * jnp.where(gains, curvature, 1.0)), 0.0, 1.0)
+    most = 2 * jnp.where(gains & (curvature > 0), curvature, 1.0)
+    part = jnp.clip((h * power - slope) / most, 0.0, 1.0)
     limited = jax.tree.map(lambda b, d, a: jnp.where(gains, b + part * d, a), before, change, after)
     return limited, jnp.asarray(gains, jnp.result_type(energy))
 
@@ -259,11 +260,6 @@ def motor_power(car: Car, drive: motor.Drive, wheels: Wheels) -> Scalar:
     """Power that the motor supplies at these wheel speeds (W), at least 0."""
     driven = drivetrain.driven_speed(car, wheels)
     return jnp.maximum((drive.torque - drive.slope * driven) * driven, 0.0)
-
-
-def pushed_power(held: "Grip") -> Scalar:
-    """Power that the shifts of Magic Formula tyres supply (W), at least 0."""
-    return sum(jnp.maximum(c.force_x * c.slip_x + c.force_y * c.slip_y, 0.0) for c in held.contacts)
 
 
 def follow(car: Car, motion: Motion, goal: Command, h: Scalar) -> Motion:
@@ -346,8 +342,8 @@ def implicit(
     for c, w in zip(held.contacts, tangent_weight, strict=True):
         along.append(c.k_x + w * (c.tangent_x - c.k_x))
         across.append(c.k_y + w * (c.tangent_y - c.k_y))
-        push_x.append(c.push_x + w * (c.tangent_x - c.k_x) * c.slip_x)
-        push_y.append(c.push_y + w * (c.tangent_y - c.k_y) * c.slip_y)
+        push_x.append(w * c.push_x)
+        push_y.append(w * c.push_y)
     # Torque impulse per slip speed, J + h b, and J + h (R² k + b) of each wheel.
     pull = [h * tire.radius * k for tire, k in zip(tires, along, strict=True)]
     bare = [tire.inertia + h * b for tire, b in zip(tires, held.drag, strict=True)]
@@ -396,7 +392,8 @@ def implicit(
         )
     matrix = matrix.plus(coupled.front_front, pulls[0]).plus(coupled.rear_rear, pulls[1])
     matrix = matrix.plus_mixed(coupled.front_rear, pulls[0], pulls[1])
-    after = chassis.solve(matrix, momentum)
+    least = Vector(body.mass, body.mass, body.yaw_inertia)
+    after = chassis.solve(matrix, momentum, least)
     pushed = Wheels(*(free[i] + pull[i] * dot(rolls[i], after) for i in range(4)))
     return after, _speeds(front, rear, coupled, pushed)
 
@@ -435,7 +432,8 @@ def kinetic_energy(car: Car, velocity: Vector, wheels: Wheels) -> Scalar:
 
 def collide(state: State, tick: Tick) -> tuple[State, Tick]:
     """Move the car out of its deepest contact with a wall, apply the impulse, count new touches."""
-    motion, touches = walls.collide(tick.car.body, tick.walls, state.motion)
+    start = state.motion if tick.start is None else tick.start
+    motion, touches = walls.collide(tick.car.body, tick.walls, start, state.motion)
     fresh = touches * jnp.where(state.touching <= 0, 1.0, 0.0)
     touching = jnp.where(touches > 0, TOUCH_TIME, jnp.maximum(state.touching - tick.dt, 0.0))
     return (

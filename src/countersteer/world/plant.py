@@ -84,7 +84,9 @@ def rollout(
     stages = (planar.move,) if walls is None else (planar.move, planar.collide, planar.judge)
 
     def tick(state: State, now: Command) -> tuple[State, None]:
-        work = planar.Tick(car, nowhere if walls is None else walls, now, now, 0, dt, floor)
+        work = planar.Tick(
+            car, nowhere if walls is None else walls, now, now, 0, dt, floor, state.motion
+        )
         for stage in stages:
             state, work = stage(state, work)
         return state, None

@@ -39,11 +39,10 @@ def directions(
     tan(side) = t / (1 -+ share t track / (2 wheelbase)), with t = tan(steering) and - for left.
     """
     cosine, sine = cosine_sine(steering)
-    tangent = sine / cosine
-    spread = servo.ackermann * tangent * body.track / (2 * body.wheelbase)
+    spread = servo.ackermann * sine * body.track / (2 * body.wheelbase)
 
-    def direction(t: Scalar) -> tuple[Scalar, Scalar]:
-        cosine = jax.lax.rsqrt(1 + t**2)
-        return cosine, t * cosine
+    def direction(ahead: Scalar) -> tuple[Scalar, Scalar]:
+        length = jax.lax.rsqrt(ahead**2 + sine**2)
+        return ahead * length, sine * length
 
-    return direction(tangent / (1 - spread)), direction(tangent / (1 + spread))
+    return direction(cosine - spread), direction(cosine + spread)

@@ -10,19 +10,21 @@ from countersteer.car.car import MagicFormula, Tire
 from countersteer.signals import Scalar
 
 TINY = 1e-9  # keeps roots and their derivatives finite at zero slip
+LEAST_LOSS = 0.1  # of a Magic Formula, at pure slip. Published sets have 1, to a thousandth.
 
 
 class Contact(NamedTuple):
     """A contact at an instant: its slip velocity (m/s) and its stiffness against it (N s/m).
 
-    Its force is push - k · slip velocity.
+    Its force is push - tangent · slip velocity. Its chord -k · slip velocity removes energy. For a
+    brush tyre the two are equal. Of a Magic Formula's force, the chord is the part along the slip.
     """
 
     slip_x: Scalar
     slip_y: Scalar
     k_x: Scalar  # >= 0
     k_y: Scalar
-    push_x: Scalar  # N; 0 for a brush tyre
+    push_x: Scalar  # N
     push_y: Scalar
     tangent_x: Scalar  # -d force / d slip velocity, >= 0
     tangent_y: Scalar
@@ -30,12 +32,12 @@ class Contact(NamedTuple):
     @property
     def force_x(self) -> Scalar:
         """Force along the wheel, forward (N)."""
-        return self.push_x - self.k_x * self.slip_x
+        return self.push_x - self.tangent_x * self.slip_x
 
     @property
     def force_y(self) -> Scalar:
         """Force to the wheel's left (N)."""
-        return self.push_y - self.k_y * self.slip_y
+        return self.push_y - self.tangent_y * self.slip_y
 
 
 def contact(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar) -> Contact:
@@ -86,13 +88,14 @@ def brush(tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: S
     tangent_x = part_x * slope * linear_x + (1 - part_x) * k_x
     tangent_y = (1 - part_x) * slope * linear_y + part_x * k_y
     k_x, tangent_x = ellipse**2 * k_x, ellipse**2 * tangent_x
-    return Contact(true_x, slip_y, k_x, k_y, 0.0, 0.0, tangent_x, tangent_y)
+    push_x, push_y = (tangent_x - k_x) * true_x, (tangent_y - k_y) * slip_y
+    return Contact(true_x, slip_y, k_x, k_y, push_x, push_y, tangent_x, tangent_y)
 
 
 def magic_formula(
     tire: Tire, load: Scalar, slip_x: Scalar, slip_y: Scalar, rim_speed: Scalar
 ) -> Contact:
-    """The Magic Formula in combined slip. k is the slope of its tangent, at least 0.
+    """The Magic Formula in combined slip. The tangent is its slope, at least 0.
 
     With the hub's speed u = slip_x + R w, the slip is slip_x / max(|u|, creep) and the slip angle
     atan(slip_y / max(|u|, creep)). The formula's shifts push even at zero slip. They fade out
@@ -112,10 +115,11 @@ def magic_formula(
         lambda x: force(x, slip_y), (slip_x,), (jnp.ones_like(slip_x),)
     )
     _, slope_y = jax.jvp(lambda y: force(slip_x, y), (slip_y,), (jnp.ones_like(slip_y),))
-    k_x, k_y = jnp.maximum(-slope_x[0], 0.0), jnp.maximum(-slope_y[1], 0.0)
-    return Contact(
-        slip_x, slip_y, k_x, k_y, force_x + k_x * slip_x, force_y + k_y * slip_y, k_x, k_y
-    )
+    tangent_x, tangent_y = jnp.maximum(-slope_x[0], 0.0), jnp.maximum(-slope_y[1], 0.0)
+    removed = jnp.maximum(-force_x * slip_x - force_y * slip_y, 0.0)
+    k = removed / (slip_x**2 + slip_y**2 + TINY**2)
+    push_x, push_y = force_x + tangent_x * slip_x, force_y + tangent_y * slip_y
+    return Contact(slip_x, slip_y, k, k, push_x, push_y, tangent_x, tangent_y)
 
 
 def magic_forces(
@@ -131,16 +135,17 @@ def magic_forces(
 
     The force along is its pure force times G(angle + shift) / G(shift). The force across is its
     pure force times G(slip + shift) / G(shift), plus a shift by slip. `shifts` scales all shifts.
+    G(shift) is taken as `LEAST_LOSS` if it is less.
 
     Source: H. B. Pacejka, Tire and Vehicle Dynamics, chapter 4; CommonRoad vehicle models 3.0.2.
     """
 
     def bent(b: Scalar, curvature: Scalar) -> Scalar:
-        return jnp.arctan(b - curvature * (b - jnp.arctan(b)))
+        return jnp.arctan((1 - curvature) * b + curvature * jnp.arctan(b))
 
     def loss(steepness: Scalar, c: Scalar, e: Scalar, b: Scalar, shift: Scalar) -> Scalar:
         shifted = jnp.cos(c * bent(steepness * (b + shift), e))
-        return shifted / jnp.cos(c * bent(steepness * shift, e))
+        return shifted / jnp.maximum(jnp.cos(c * bent(steepness * shift, e)), LEAST_LOSS)
 
     along = m.p_kx1 / (m.p_cx1 * m.p_dx1) * (-slip + shifts * m.p_hx1)
     pure_x = m.p_dx1 * jnp.sin(m.p_cx1 * bent(along, m.p_ex1) + shifts * load * m.p_vx1)

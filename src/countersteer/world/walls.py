@@ -11,9 +11,12 @@ import numpy as np
 from countersteer.car.car import Body
 from countersteer.signals import Motion, Scalar
 from countersteer.world.angle import cosine_sine
+from countersteer.world.chassis import Vector, combine
 
 FAR = 1e5  # m, position of padding
 LEAST = 8  # rows of the shortest array
+CLEARANCE = 1e-3  # m, by which the centre of a car stays away from a wall
+STILL = 1e-20  # m, of a way that is none
 FEW = 16  # walls; up to so many are compared one by one
 PREFERENCE = 1e-3  # reduction of a wall's depth, per distance by which it misses the corner
 
@@ -100,8 +103,37 @@ def overlap(body: Body, wall: Wall) -> Overlap:
     )
 
 
-def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scalar]:
+def clear_part(walls: Wall, x: Scalar, y: Scalar, dx: Scalar, dy: Scalar) -> Scalar:
+    """The part (0 to 1) of a straight way from a point that ends `CLEARANCE` before any wall.
+
+    `walls` hold arrays, one row a wall. Around each is a rectangle, larger than it by the
+    clearance on all sides. A point within a rectangle can only move away from its wall.
+    """
+    from_x, from_y = x - walls.x, y - walls.y
+    aside = walls.along_x * from_y - walls.along_y * from_x  # to the wall's left
+    along = walls.along_x * from_x + walls.along_y * from_y
+    moves_aside = walls.along_x * dy - walls.along_y * dx
+    moves_along = walls.along_x * dx + walls.along_y * dy
+
+    def within(at: Scalar, moves: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
+        """The parts of the way at which it comes between two bounds, and leaves them."""
+        per = 1 / jnp.where(jnp.abs(moves) < STILL, STILL, moves)
+        first, second = (low - at) * per, (high - at) * per
+        return jnp.minimum(first, second), jnp.maximum(first, second)
+
+    sides = within(aside, moves_aside, -CLEARANCE, CLEARANCE)
+    ends = within(along, moves_along, -CLEARANCE, walls.length + CLEARANCE)
+    enters, leaves = jnp.maximum(sides[0], ends[0]), jnp.minimum(sides[1], ends[1])
+    meets = (enters < leaves) & (leaves > 0) & ((enters > 0) | (aside * moves_aside < 0))
+    return jnp.min(jnp.where(meets, jnp.clip(enters, 0.0, 1.0), 1.0))
+
+
+def collide(body: Body, walls: jax.Array, before: Motion, motion: Motion) -> tuple[Motion, Scalar]:
     """The motion after the deepest contact with a wall, and 1 if there was one, else 0.
+
+    The centre of the rectangle never crosses a wall: its straight way from `before`, a tick ago,
+    ends at the first one. So does its way from there to its place after the contact. So no speed
+    or step is too large. A tick's rest is lost where a way was cut short.
 
     `walls` is (n, 4), the ends of segments in metres. Rows of NaN touch nothing. Rectangle and
     segment overlap unless one of three axes separates them: the rectangle's two and the segment's
@@ -110,12 +142,18 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     touching part. Otherwise it is the deepest end of the segment. The car is moved out along the
     normal. An approaching contact takes an impulse (`impulse`).
     """
+    rows = _segments(walls)
     cosine, sine = cosine_sine(motion.heading)
+    cosine_before, sine_before = cosine_sine(before.heading)
+    from_x, from_y = before.x + body.center * cosine_before, before.y + body.center * sine_before
+    dx, dy = motion.x + body.center * cosine - from_x, motion.y + body.center * sine - from_y
+    way = clear_part(rows, from_x, from_y, dx, dy)
+    x, y = from_x + way * dx, from_y + way * dy
 
     def to_body(wall: Wall) -> Wall:
-        dx, dy = wall.x - motion.x, wall.y - motion.y
+        dx, dy = wall.x - x, wall.y - y
         return Wall(
-            cosine * dx + sine * dy - body.center,
+            cosine * dx + sine * dy,
             cosine * dy - sine * dx,
             cosine * wall.along_x + sine * wall.along_y,
             cosine * wall.along_y - sine * wall.along_x,
@@ -127,12 +165,13 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
         against = overlap(body, to_body(wall))
         return against.depth - jnp.where(against.depth > 0, PREFERENCE * against.missed, 0.0)
 
-    wall = to_body(_highest(score, _segments(walls)))
+    wall = to_body(_highest(score, rows))
     ax, ay = wall.x, wall.y
     bx, by = wall.end
     deepest = overlap(body, wall)
     hits = deepest.depth > 0
-    by_wall = deepest.on_wall <= jnp.minimum(deepest.on_x, deepest.on_y)
+    # A centre that was stopped before a wall goes back, whatever the outline.
+    by_wall = (way < 1) | (deepest.on_wall <= jnp.minimum(deepest.on_x, deepest.on_y))
     by_x = deepest.on_x <= deepest.on_y
     from_front = deepest.ahead < deepest.behind
     from_left = deepest.to_left < deepest.to_right
@@ -165,18 +204,41 @@ def collide(body: Body, walls: jax.Array, motion: Motion) -> tuple[Motion, Scala
     impulse_n, impulse_t = jnp.where(meets, impulse_n, 0.0), jnp.where(meets, impulse_t, 0.0)
 
     out = jnp.where(hits, deepest.depth, 0.0)
-    out_x, out_y = out * normal_x, out * normal_y
+    dx = x + out * (cosine * normal_x - sine * normal_y) - from_x
+    dy = y + out * (sine * normal_x + cosine * normal_y) - from_y
+    part = clear_part(rows, from_x, from_y, dx, dy)
     force_x = normal_x * impulse_n - normal_y * impulse_t
     force_y = normal_y * impulse_n + normal_x * impulse_t
-    moved = motion._replace(
-        x=motion.x + cosine * out_x - sine * out_y,
-        y=motion.y + sine * out_x + cosine * out_y,
-        vx=motion.vx + force_x / body.mass,
-        vy=motion.vy + force_y / body.mass,
-        yaw_rate=motion.yaw_rate + (point_x * force_y - point_y * force_x) / body.yaw_inertia,
+    velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
+    change = Vector(
+        force_x / body.mass,
+        force_y / body.mass,
+        (point_x * force_y - point_y * force_x) / body.yaw_inertia,
     )
-    touched = jax.tree.map(lambda a, b: jnp.where(hits, a, b), moved, motion)
+    after = combine(1.0, velocity, passive_part(body, velocity, change), change)
+    moved = motion._replace(
+        x=from_x + part * dx - body.center * cosine,
+        y=from_y + part * dy - body.center * sine,
+        vx=after.x,
+        vy=after.y,
+        yaw_rate=after.yaw,
+    )
+    stopped = hits | (way < 1)
+    touched = jax.tree.map(lambda a, b: jnp.where(stopped, a, b), moved, motion)
     return touched, jnp.where(hits, 1.0, 0.0)
+
+
+def passive_part(body: Body, velocity: Vector, change: Vector) -> Scalar:
+    """The part of a change of velocity that adds no energy: 1, but for rounding.
+
+    The energy after a part p is E + p g + p² K. If the whole change adds energy, p = -g / 2K.
+    """
+    inertia = Vector(body.mass, body.mass, body.yaw_inertia)
+    slope = sum(m * v * d for m, v, d in zip(inertia, velocity, change, strict=True))
+    curvature = sum(m * d**2 for m, d in zip(inertia, change, strict=True)) / 2
+    gains = slope + curvature > 0
+    part = jnp.clip(-slope / (2 * jnp.where(curvature > 0, curvature, 1.0)), 0.0, 1.0)
+    return jnp.where(gains, part, 1.0)
 
 
 def _segments(walls: jax.Array) -> Wall:
@@ -231,7 +293,8 @@ def impulse(
     sticks = (stick_n > 0) & (jnp.abs(stick_t) <= mu * stick_n)
     n, t = jnp.where(sticks, stick_n, n), jnp.where(sticks, stick_t, t)
     change = n * speed_n + t * speed_t + (k_nn * n**2 + 2 * k_nt * n * t + k_tt * t**2) / 2
-    bound = jnp.sqrt(jnp.maximum(-2 * change / k_nn, 1e-30))
+    left = -2 * change / k_nn
+    bound = jnp.where(left > 0, jnp.sqrt(jnp.where(left > 0, left, 1.0)), 0.0)
     return n + jnp.minimum(body.wall_restitution * n, bound), t
 
 
