@@ -220,12 +220,12 @@ def guarded(
     """
     power = jnp.maximum(*(motor_power(car, held.drive, wheels) for _, wheels in (before, after)))
     change = jax.tree.map(lambda a, b: a - b, after, before)
-    energy, curvature = kinetic_energy(car, *before), kinetic_energy(car, *change)
-    gain = kinetic_energy(car, *after) - energy
+    energy, slope = kinetic_energy(car, *before), kinetic_product(car, before, change)
+    curvature = kinetic_energy(car, *change)
+    gain = slope + curvature
     precision = jnp.finfo(jnp.result_type(energy))
     # A gain within rounding is none, nor is one that is as good as 0: squares of speeds underflow.
     gains = gain > h * power + 4 * precision.eps * energy + precision.tiny / precision.eps
-    slope = gain - curvature
     most = 2 * jnp.where(gains & (curvature > 0), curvature, 1.0)
     part = jnp.clip((h * power - slope) / most, 0.0, 1.0)
     limited = jax.tree.map(lambda b, d, a: jnp.where(gains, b + part * d, a), before, change, after)
@@ -421,13 +421,17 @@ def contact_directions(car: Car, steered: Steered) -> tuple[Wheels, Wheels]:
 
 def kinetic_energy(car: Car, velocity: Vector, wheels: Wheels) -> Scalar:
     """Kinetic energy of the body, the wheels' spin and the rotor (J)."""
-    energy = (
-        car.body.mass * (velocity.x**2 + velocity.y**2) + car.body.yaw_inertia * velocity.yaw**2
-    )
-    for tire, speed in zip(tires_by_wheel(car), wheels, strict=True):
-        energy = energy + tire.inertia * speed**2
-    driven = drivetrain.driven_speed(car, wheels)
-    return (energy + drivetrain.rotor_inertia(car) * driven**2) / 2
+    return kinetic_product(car, (velocity, wheels), (velocity, wheels)) / 2
+
+
+def kinetic_product(car: Car, a: tuple[Vector, Wheels], b: tuple[Vector, Wheels]) -> Scalar:
+    """The product a · M b of velocities of body and wheels, M the matrix of inertias (J)."""
+    (v, spins), (w, others) = a, b
+    product = car.body.mass * (v.x * w.x + v.y * w.y) + car.body.yaw_inertia * v.yaw * w.yaw
+    for tire, spin, other in zip(tires_by_wheel(car), spins, others, strict=True):
+        product = product + tire.inertia * spin * other
+    rotor = drivetrain.driven_speed(car, spins) * drivetrain.driven_speed(car, others)
+    return product + drivetrain.rotor_inertia(car) * rotor
 
 
 def collide(state: State, tick: Tick) -> tuple[State, Tick]:
