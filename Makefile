@@ -7,7 +7,7 @@ READY := .venv/ready
 # What a drive needs; `make test` and the rest add to it. Modules are compiled when they are imported.
 DRIVES := .venv/drives
 
-.PHONY: drive test check accuracy recovery estimation bench notebook clean
+.PHONY: drive test check accuracy recovery estimation hostile bench notebook clean
 
 drive: $(DRIVES)
 	$(BIN)/countersteer drive box
@@ -30,6 +30,12 @@ recovery: $(READY)
 # Some twenty programs to compile, then 256 cars in each: ten minutes or more on two cores.
 estimation: $(READY)
 	$(BIN)/python -m studies.estimation docs/estimation.md
+
+# Random cars, damaged files and killed commands: half an hour on two cores.
+hostile: $(READY)
+	$(BIN)/python -m studies.fuzz_physics
+	$(BIN)/python -m studies.fuzz_files
+	$(BIN)/python -m studies.kills
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks.speed docs/speed.md
