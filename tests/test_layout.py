@@ -12,7 +12,7 @@ PACKAGE = ROOT / "src" / "countersteer"
 
 EVERYONE = {
     "errors", "text", "progress", "signals", "random_streams", "compiling", "kept_programs",
-    "cache", "writing", "reading",
+    "cache", "clock", "writing", "reading",
 }  # fmt: skip
 MAY_IMPORT = {
     "car": set(),

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from countersteer.batch.engine import LANES
 from countersteer.batch.population import Drawn, Population, draw
 from countersteer.batch.separation import separation_line
 from countersteer.batch.trials import Watch, run_trials
@@ -67,7 +66,7 @@ class Trials:
         watch: Watch | None,
         report: Callable[[int, int], None] = lambda *_: None,
         faults: tuple[SensorFault, ...] = (),
-        lanes: int = LANES,
+        lanes: int | None = None,
     ) -> tuple[Score, Any]:
         """The scores, as `run`, and the result of `watch`. `faults` holds times for each trial."""
         drawn = self.drawn

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from countersteer.clock import shared
 from countersteer.estimation.estimate import Estimate
 from countersteer.signals import Command, Scalar
 
@@ -99,7 +100,7 @@ def paced(
             (memory.command, memory),
         )
 
-    due = seen.time - memory.time > period - ROUNDING
+    due = shared(seen.time - memory.time > period - ROUNDING)
     held: tuple[Command, Any] = jax.lax.cond(
         due, typed, lambda same, _: (same.command, same), memory, seen
     )

@@ -14,6 +14,7 @@ import numpy as np
 
 from countersteer.car.car import Sonar
 from countersteer.car.parameter import pytree
+from countersteer.clock import shared
 from countersteer.course.course import Course
 from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.velocity.filter import VelocityFilter
@@ -276,7 +277,7 @@ class PoseEstimator:
             cloud = self.place.update(place.cloud, readings.sonar, known, h)
             return Located(cloud, best(cloud), tick)
 
-        place = jax.lax.cond(since >= self.every, step, lambda same: same, memory[1])
+        place = jax.lax.cond(shared(since >= self.every), step, lambda same: same, memory[1])
         return moves, place
 
     def estimate(self, memory: tuple[VelocityMemory, Located]) -> Estimate:
