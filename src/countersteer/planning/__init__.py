@@ -1,0 +1,1 @@
+"""Planners that know the car's model."""

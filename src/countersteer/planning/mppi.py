@@ -1,0 +1,276 @@
+"""MPPI: an expert driver that plans with the nominal car's model, 50 times a second.
+
+Each decision draws `samples` sequences of commands around the best one so far, drives each of them
+for `HORIZON` on the plant, and takes their mean with the weights
+
+    w_i = exp(-(J_i - min J) / temperature)
+
+J is the cost of a drive (`Costs`). The first command of the mean is given, and the rest, moved on
+by a knot, is where the next decision begins. What no sensor reports (wheel speeds, steering, duty,
+loads) is the model's own prediction from the commands that were given.
+
+Source: G. Williams et al., Information-Theoretic Model Predictive Control, IEEE T-RO 34, 2018.
+"""
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from countersteer.car.car import Car
+from countersteer.course.course import Course
+from countersteer.drivers.driver import Observation
+from countersteer.planning.ground import Ground, ground_of, start_of
+from countersteer.signals import Array, Command, Motion, Scalar, Wheels
+from countersteer.world import plant
+
+KNOT = 0.02  # s for which a command is held: one decision
+HORIZON = 0.8  # s
+KNOTS = round(HORIZON / KNOT)
+STEP = 0.005  # s of the plant
+SAMPLES = 1000
+
+
+class Costs(NamedTuple):
+    """Weights of the terms of a drive's cost. Each term is a mean over the horizon, but progress.
+
+    The unit is that of progress: a metre.
+    """
+
+    progress: float = 1.0  # per m along the line up to the goal, negative
+    goal: float = 5.0  # of the part of the horizon that lies behind the goal, negative
+    speed: float = 0.5  # behind the goal: of the speed, in m/s
+    facing: float = 2.0  # behind the goal: of 1 - cos(heading off the line)
+    clearance: float = 20.0  # of the square of how far a corner comes within `margin`, over it
+    hit: float = 30.0  # of the time with a corner beyond a wall
+    sideslip: float = 1.0  # in corners: of how far the sideslip is from `drift`, over it
+    overshoot: float = 4.0  # of the square of the heading beyond the corner's way out, rad²
+    smoothness: float = 0.05  # of the square of the change of a command, in full commands, a knot
+    backwards: float = 2.0  # of the part of the velocity against the line, over its size
+    margin: float = 0.08  # m
+    drift: float = math.radians(36)
+
+
+class Search(NamedTuple):
+    """How commands are drawn. Deviations are of a knot; the next knot keeps the part `lasting`."""
+
+    throttle: float = 0.5
+    steering: float = 0.5  # of the full lock
+    lasting: float = 0.8
+    temperature: float = 0.05
+
+
+class Problem(NamedTuple):
+    """All that a plan is made for, as 32-bit arrays."""
+
+    car: Car
+    ground: Ground
+    costs: Costs
+    search: Search
+    lock: Scalar  # rad, full steering
+    goal: Scalar  # m along the line; inf: none
+
+
+class Memory(NamedTuple):
+    """The planner between two decisions."""
+
+    key: Array  # as plain numbers
+    motion: Motion  # predicted for the next decision
+    place: Scalar  # along the line, m
+    commands: Command  # (KNOTS,) the plan
+    given: Command  # (HISTORY,) the last commands, the newest last
+
+
+HISTORY = 16  # knots; a longer pure delay is cut off
+SEEN = ("x", "y", "heading", "vx", "vy", "yaw_rate")
+
+
+def per_tick(problem: Problem, given: Command, commands: Command) -> Command:
+    """Commands (knots,) as they reach motor and servo, a value for each step of the plant."""
+    each = round(KNOT / STEP)
+    asked = jax.tree.map(lambda a, b: jnp.repeat(jnp.concatenate([a, b]), each), given, commands)
+    arrives = plant.as_it_arrives(problem.car, asked, STEP)
+    return jax.tree.map(lambda line: line[HISTORY * each :], arrives)
+
+
+def drive(problem: Problem, motion: Motion, given: Command, commands: Command) -> Motion:
+    """The motion after each knot of a plan: leaves (knots,)."""
+    state = plant.state_of(problem.car, motion, STEP)
+    ticks = per_tick(problem, given, commands)
+    every = round(KNOT / STEP)
+    _, seen = plant.rollout(problem.car, state, ticks, every, STEP, lambda s: s.motion)
+    return seen
+
+
+def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> Scalar:
+    """J of a drive (leaves (knots,)) that began at a place."""
+    ground, costs, body = problem.ground, problem.costs, problem.car.body
+
+    def on(place: Scalar, at: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        place = ground.follow(*at, place)
+        return place, place
+
+    end, places = jax.lax.scan(on, place, (motion.x, motion.y))
+    row = ground.row(places)
+    cosine, sine = jnp.cos(motion.heading), jnp.sin(motion.heading)
+    nearest = jnp.full_like(motion.x, jnp.inf)
+    for ahead in (body.center + body.length / 2, body.center - body.length / 2):
+        for left in (body.width / 2, -body.width / 2):
+            corner_x = motion.x + cosine * ahead - sine * left
+            corner_y = motion.y + sine * ahead + cosine * left
+            nearest = jnp.minimum(nearest, ground.clear(corner_x, corner_y))
+    close = jnp.clip((costs.margin - nearest) / costs.margin, 0.0, 3.0) ** 2
+    # A drive that has met a wall is over.
+    hit = jnp.cumsum(jnp.where(nearest <= 0, 1.0, 0.0)) > 0
+
+    bend = ground.bend[row]
+    slip = -bend * jnp.arctan2(motion.vy, jnp.maximum(motion.vx, 0.1))  # positive: nose in
+    shy = jnp.abs(bend) * jnp.clip(1 - slip / costs.drift, 0.0, 2.0)
+    out_x, out_y = ground.out_x[row], ground.out_y[row]
+    beyond = jnp.arctan2(out_x * sine - out_y * cosine, out_x * cosine + out_y * sine)
+    over = jnp.maximum(bend * beyond, 0.0) ** 2
+    speed = jnp.sqrt(motion.vx**2 + motion.vy**2) + 0.1
+    east, north = cosine * motion.vx - sine * motion.vy, sine * motion.vx + cosine * motion.vy
+    forward = (east * ground.along_x[row] + north * ground.along_y[row]) / speed
+    turned = 1 - cosine * ground.along_x[row] - sine * ground.along_y[row]
+    changes = jnp.diff(commands.throttle) ** 2 + (jnp.diff(commands.steering) / problem.lock) ** 2
+    arrived = jnp.where(places > problem.goal, 1.0, 0.0)
+    left = jnp.minimum(end, problem.goal) - jnp.minimum(place, problem.goal)
+    return (
+        -costs.progress * left
+        + jnp.mean(arrived * (costs.speed * speed + costs.facing * turned - costs.goal))
+        + costs.clearance * jnp.mean(close)
+        + costs.hit * jnp.mean(jnp.where(hit, 1.0, 0.0))
+        + costs.sideslip * jnp.mean(shy)
+        + costs.overshoot * jnp.mean(over)
+        + costs.smoothness * jnp.sum(changes)
+        + costs.backwards * jnp.mean(jnp.maximum(0.3 - forward, 0.0))
+    )
+
+
+def draw(problem: Problem, key: Array, plan: Command, samples: int) -> Command:
+    """Sequences of commands (samples, KNOTS) around a plan. The first is the plan itself."""
+    search = problem.search
+    normal = jax.random.normal(key, (2, samples, KNOTS), jnp.float32)
+    normal = normal.at[:, 0].set(0.0)
+    fresh = jnp.sqrt(1 - search.lasting**2)
+
+    def follow(before: Array, new: Array) -> tuple[Array, Array]:
+        now = search.lasting * before + fresh * new
+        return now, now
+
+    _, noise = jax.lax.scan(follow, normal[:, :, 0], normal.transpose(2, 0, 1))
+    throttle = plan.throttle + search.throttle * noise[:, 0].T
+    steering = plan.steering + search.steering * problem.lock * noise[:, 1].T
+    return Command(jnp.clip(throttle, -1.0, 1.0), jnp.clip(steering, -problem.lock, problem.lock))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def decide(
+    mesh: Mesh, samples: int, problem: Problem, memory: Memory, motion: Motion
+) -> tuple[Command, Memory]:
+    """The command of the next knot, and the memory after it."""
+    key, fresh = jax.random.split(jax.random.wrap_key_data(memory.key))
+    place = problem.ground.follow(motion.x, motion.y, memory.place)
+    drawn = draw(problem, fresh, memory.commands, samples)
+    cut, same = PartitionSpec("core"), PartitionSpec()
+
+    def on_core(
+        drawn: Command, problem: Problem, motion: Motion, given: Command, place: Scalar
+    ) -> Scalar:
+        def one(commands: Command) -> Scalar:
+            driven = drive(problem, motion, given, commands)
+            return cost(problem, place, driven, commands)
+
+        return jax.vmap(one)(drawn)
+
+    found = jax.shard_map(
+        on_core, mesh=mesh, in_specs=(cut, same, same, same, same), out_specs=cut, check_vma=False
+    )(drawn, problem, motion, memory.given, place)
+    found = jnp.where(jnp.isfinite(found), found, jnp.inf)
+    weights = jnp.exp((jnp.min(found) - found) / problem.search.temperature)
+    weights = weights / jnp.sum(weights)
+    plan = jax.tree.map(lambda lines: weights @ lines, drawn)
+    command = jax.tree.map(lambda line: line[0], plan)
+    # Where the model will be when the next command is given.
+    first = jax.tree.map(lambda line: line[:1], plan)
+    after = jax.tree.map(lambda leaf: leaf[-1], drive(problem, motion, memory.given, first))
+    moved = jax.tree.map(lambda line: jnp.append(line[1:], line[-1]), plan)
+    given = jax.tree.map(lambda line, new: jnp.append(line[1:], new), memory.given, command)
+    return command, Memory(jax.random.key_data(key), after, place, moved, given)
+
+
+class Mppi:
+    """The driver `mppi`. It needs a pose: `--estimate pose` or `truth`."""
+
+    period = KNOT
+
+    def __init__(
+        self,
+        course: Course,
+        car: Car,
+        laps: int = 1,
+        *,
+        costs: Costs = Costs(),  # noqa: B008  # it cannot change
+        search: Search = Search(),  # noqa: B008
+        samples: int = SAMPLES,
+    ) -> None:
+        """For a course with a centre line and the nominal car. Raises `InputError`."""
+        ground = ground_of(course)
+        lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
+        self._mesh = Mesh(np.array(jax.devices()), ("core",))
+        self._samples = math.ceil(samples / self._mesh.size) * self._mesh.size
+        self._start, self._place = course.start, start_of(course, ground)
+        self._radii = [float(t.radius) for t in (car.tires.front, car.tires.rear)]
+        end = course.lap_end(laps)
+        goal = math.inf if end is None else self._place + end - course.start_distance
+        self._problem = self._put(Problem(car, ground, costs, search, lock, goal))
+
+    def _put(self, tree: Any) -> Any:
+        """The tree on all cores, in 32 bits: inputs of one kind share one program."""
+        here = NamedSharding(self._mesh, PartitionSpec())
+
+        def put(leaf: Any) -> Any:
+            array = np.asarray(leaf)
+            return jax.device_put(
+                array.astype(np.float32) if array.dtype.kind == "f" else array, here
+            )
+
+        with jax.enable_x64(False):
+            return jax.tree.map(put, tree)
+
+    def reset(self, key: Array) -> Memory:
+        """At rest at the start, with no throttle planned."""
+        zero = 0.0
+        motion = Motion(*self._start, zero, zero, zero, Wheels(*[zero] * 4), *[zero] * 4, 1.0)
+        none = Command(np.zeros(KNOTS), np.zeros(KNOTS))
+        given = Command(np.zeros(HISTORY), np.zeros(HISTORY))
+        memory: Memory = self._put(
+            Memory(jax.random.key_data(key), motion, self._place, none, given)
+        )
+        return memory
+
+    def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
+        """One decision."""
+        with jax.enable_x64(False):
+            motion = self._now(memory.motion, observation)
+            command, memory = decide(self._mesh, self._samples, self._problem, memory, motion)
+        return Command(float(command.throttle), float(command.steering)), memory
+
+    def _now(self, predicted: Motion, observation: Observation) -> Motion:
+        """The prediction with the estimate's pose and velocities. Wheels keep their slip."""
+        estimate = observation.estimate
+        seen = {name: float(getattr(estimate, name)) for name in SEEN}
+        faster = seen["vx"] - float(predicted.vx)
+        wheels = Wheels(
+            *(
+                float(speed) + faster / radius
+                for speed, radius in zip(predicted.wheels, np.repeat(self._radii, 2), strict=True)
+            )
+        )
+        moved: Motion = self._put(predicted._replace(wheels=wheels, **seen))
+        return moved
