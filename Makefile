@@ -13,7 +13,7 @@ drive: $(DRIVES)
 	$(BIN)/countersteer drive box
 
 test: $(READY)
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/python tests/run.py
 
 check: $(READY)
 	$(BIN)/ruff check .

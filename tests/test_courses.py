@@ -171,7 +171,7 @@ CIRCLE = "".join(f"{3 * math.cos(a)},{3 * math.sin(a)},1,1\n" for a in ANGLES[::
         ("0,0,1,1\n1,0,1,1\n", "2 points that differ, not 3 to"),
         (CIRCLE + "nan,0,1,1\n", "line 21: x_m must be a number in"),
         (CIRCLE + "0,inf,1,1\n", "line 21: y_m must be a number in"),
-        (CIRCLE + "0,0,-1,1\n", "line 21: w_tr_right_m must be a number in [0, 1000], not '-1'"),
+        (CIRCLE + "0,0,-1,1\n", "line 21: w_tr_right_m must be a number in [0, 1000], not -1.0"),
         (CIRCLE + "0,0,0,0\n", "line 21: less than 0.05 m wide"),
         (CIRCLE + "0,0,1\n", "line 21: 3 cells, not 4"),
         (CIRCLE + "a,b,c,d\n", "line 21: x_m must be a number"),

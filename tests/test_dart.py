@@ -208,7 +208,7 @@ GOOD = "0.1,0,0,0,0,0,1.0,1,0.5,0.0"
         (f"{RECORDING}\n{GOOD}\n0.2,0,0\n", "line 3: 3 cells"),
         (f"{CAPTURED}\n0{9 * ',0'},5.0,0,0,0\n0{9 * ',0'},5.1,0,0,0\n", "never changes"),
         ("vx body\n1.0\n", "'vicon time' is missing"),
-        ("x" * 200_000, "not a DART log"),
+        ("x" * 200_000, "it is no CSV file"),
     ],
 )
 def test_what_is_no_log_is_refused_in_one_line(tmp_path, content, message):

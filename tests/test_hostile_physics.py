@@ -8,7 +8,7 @@ from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.signals import Command, Motion, Wheels
 from countersteer.world import planar, tyre
-from countersteer.world.walls import clear_part, collide, padded
+from countersteer.world.walls import clear_way, collide, padded
 from studies import fuzz_physics
 
 BOX = load_course("box").walls
@@ -145,7 +145,7 @@ def test_a_way_ends_before_the_first_wall_that_it_meets() -> None:
         (0.0, 1.0005, 2.0, 0.0, (1 - 0.001) / 2),  # around an end too
         (0.0, 0.0, 0.0, 0.0, 1.0),
     ):
-        found = float(clear_part(rows, *map(np.float64, (x, y, dx, dy))))
+        found = float(clear_way(rows, *map(np.float64, (x, y, dx, dy))))
         assert found == pytest.approx(part), (x, y, dx, dy)
 
 

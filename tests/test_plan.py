@@ -247,7 +247,10 @@ GOOD = '[[policy]]\ndoes = "straighten"\n'
         ('[[policy]]\ndoes = "drift"\n', "policy 1: turn_deg must be in"),
         ('[[policy]]\ndoes = "drift"\nturn_deg = nan\n', "policy 1: turn_deg must be a number"),
         ('[[policy]]\ndoes = "commands"\nthrottle = 1\n', "policy 1: give throttle and steering"),
-        ('[[policy]]\ndoes = "commands"\ncommands = 3\n', "policy 1: commands must be the path"),
+        (
+            '[[policy]]\ndoes = "commands"\ncommands = 3\n',
+            "policy 1: commands must be a name or a path",
+        ),
         ('[[policy]]\ndoes = "commands"\ncommands = "gone.csv"\n', "gone.csv"),
     ],
 )

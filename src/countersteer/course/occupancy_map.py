@@ -118,7 +118,10 @@ def _free(about: dict[str, Any], path: Path, image: Path) -> np.ndarray:
     if mode not in ("trinary", "scale", "raw"):
         raise InputError(f"{path}: mode must be trinary, scale or raw, not {shown(mode)}")
     threshold = number(about.get("free_thresh", FREE_THRESH), f"{path}: free_thresh", 0, 1)
-    shade, opaque = read_pixels(image)
+    try:
+        shade, opaque = read_pixels(image)
+    except InputError as error:
+        raise InputError(f"{path}: image {error}") from None
     if mode == "raw":
         occupied = shade / 100  # per cent; from 101 on unknown
     else:

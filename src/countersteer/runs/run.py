@@ -70,7 +70,10 @@ def refuse_long(run: Run) -> None:
     ):  # fmt: skip
         if table is not None and len(table) and table["time_s"][-1] > LONGEST:
             last = f"{table['time_s'][-1]:g} s, over {LONGEST:g} s"
-            raise InputError(f"{run.path}/{name}.csv: goes on to {last}: cut the log into pieces")
+            raise InputError(
+                f"{run.path}/{name}.csv: goes on to {last}: convert "
+                "milliseconds, or cut the log into pieces"
+            )
 
 
 def read_summary(path: Path) -> dict[str, Any]:

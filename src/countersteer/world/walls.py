@@ -1,5 +1,6 @@
 """Walls: contact of the car's rectangle with line segments."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -103,17 +104,17 @@ def overlap(body: Body, wall: Wall) -> Overlap:
     )
 
 
-def clear_part(walls: Wall, x: Scalar, y: Scalar, dx: Scalar, dy: Scalar) -> Scalar:
-    """The part (0 to 1) of a straight way from a point that ends `CLEARANCE` before any wall.
+def clear_part(wall: Wall, x: Scalar, y: Scalar, dx: Scalar, dy: Scalar) -> Scalar:
+    """The part (0 to 1) of a straight way from a point that ends `CLEARANCE` before a wall.
 
-    `walls` hold arrays, one row a wall. Around each is a rectangle, larger than it by the
-    clearance on all sides. A point within a rectangle can only move away from its wall.
+    Around the wall is a rectangle, larger than it by the clearance on all sides. A point within it
+    can only move away from the wall.
     """
-    from_x, from_y = x - walls.x, y - walls.y
-    aside = walls.along_x * from_y - walls.along_y * from_x  # to the wall's left
-    along = walls.along_x * from_x + walls.along_y * from_y
-    moves_aside = walls.along_x * dy - walls.along_y * dx
-    moves_along = walls.along_x * dx + walls.along_y * dy
+    from_x, from_y = x - wall.x, y - wall.y
+    aside = wall.along_x * from_y - wall.along_y * from_x  # to the wall's left
+    along = wall.along_x * from_x + wall.along_y * from_y
+    moves_aside = wall.along_x * dy - wall.along_y * dx
+    moves_along = wall.along_x * dx + wall.along_y * dy
 
     def within(at: Scalar, moves: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
         """The parts of the way at which it comes between two bounds, and leaves them."""
@@ -122,10 +123,19 @@ def clear_part(walls: Wall, x: Scalar, y: Scalar, dx: Scalar, dy: Scalar) -> Sca
         return jnp.minimum(first, second), jnp.maximum(first, second)
 
     sides = within(aside, moves_aside, -CLEARANCE, CLEARANCE)
-    ends = within(along, moves_along, -CLEARANCE, walls.length + CLEARANCE)
+    ends = within(along, moves_along, -CLEARANCE, wall.length + CLEARANCE)
     enters, leaves = jnp.maximum(sides[0], ends[0]), jnp.minimum(sides[1], ends[1])
     meets = (enters < leaves) & (leaves > 0) & ((enters > 0) | (aside * moves_aside < 0))
-    return jnp.min(jnp.where(meets, jnp.clip(enters, 0.0, 1.0), 1.0))
+    return jnp.where(meets, jnp.clip(enters, 0.0, 1.0), 1.0)
+
+
+def clear_way(walls: Wall, x: Scalar, y: Scalar, dx: Scalar, dy: Scalar) -> Scalar:
+    """`clear_part` of the first of several walls, given as arrays."""
+    if walls.x.shape[0] > FEW:
+        return jnp.min(clear_part(walls, x, y, dx, dy))
+    return functools.reduce(
+        jnp.minimum, [clear_part(row, x, y, dx, dy) for row in _one_by_one(walls)]
+    )
 
 
 def collide(body: Body, walls: jax.Array, before: Motion, motion: Motion) -> tuple[Motion, Scalar]:
@@ -147,7 +157,7 @@ def collide(body: Body, walls: jax.Array, before: Motion, motion: Motion) -> tup
     cosine_before, sine_before = cosine_sine(before.heading)
     from_x, from_y = before.x + body.center * cosine_before, before.y + body.center * sine_before
     dx, dy = motion.x + body.center * cosine - from_x, motion.y + body.center * sine - from_y
-    way = clear_part(rows, from_x, from_y, dx, dy)
+    way = clear_way(rows, from_x, from_y, dx, dy)
     x, y = from_x + way * dx, from_y + way * dy
 
     def to_body(wall: Wall) -> Wall:
@@ -206,7 +216,7 @@ def collide(body: Body, walls: jax.Array, before: Motion, motion: Motion) -> tup
     out = jnp.where(hits, deepest.depth, 0.0)
     dx = x + out * (cosine * normal_x - sine * normal_y) - from_x
     dy = y + out * (sine * normal_x + cosine * normal_y) - from_y
-    part = clear_part(rows, from_x, from_y, dx, dy)
+    part = clear_way(rows, from_x, from_y, dx, dy)
     force_x = normal_x * impulse_n - normal_y * impulse_t
     force_y = normal_y * impulse_n + normal_x * impulse_t
     velocity = Vector(motion.vx, motion.vy, motion.yaw_rate)
@@ -258,13 +268,17 @@ def _highest(score: Callable[[Wall], Scalar], walls: Wall) -> Wall:
     if count > FEW:
         chosen = jnp.argmax(score(walls))
         return Wall(*(values[chosen] for values in walls))
-    rows = [Wall(*(values[i] for values in walls)) for i in range(count)]
+    rows = _one_by_one(walls)
     best, highest = rows[0], score(rows[0])
     for row in rows[1:]:
         this = score(row)
         best = Wall(*(jnp.where(this > highest, a, b) for a, b in zip(row, best, strict=True)))
         highest = jnp.maximum(this, highest)
     return best
+
+
+def _one_by_one(walls: Wall) -> list[Wall]:
+    return [Wall(*(values[i] for values in walls)) for i in range(walls.x.shape[0])]
 
 
 def impulse(
