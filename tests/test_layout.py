@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "link": {"car"},
     "estimation": {"car", "course", "world", "sensing"},
     "drivers": {"car", "course", "estimation", "world"},  # the motor's law, for feed-forward
+    "planning": {"car", "course", "world", "drivers"},
     "pilot": {"car", "course", "link", "estimation", "drivers"},  # and not the world
     "simulator": {"car", "course", "world", "sensing", "link", "drivers", "pilot"},
     "task": {"car", "course"},

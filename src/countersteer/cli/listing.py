@@ -32,6 +32,7 @@ def run(options: argparse.Namespace) -> int:
         "drivers": lambda: [
             *drivers(DRIVERS),
             *({"name": name, "description": text} for name, text in plans().items()),
+            *({"name": name, "description": text} for name, text in installed().items()),
         ],
         "parameters": lambda: parameters(options.car),
     }[options.what]()
@@ -87,6 +88,13 @@ def drivers(names: Iterable[str]) -> list[dict[str, Any]]:
         for name in names
         for module in [importlib.import_module(f"countersteer.drivers.{name.replace('-', '_')}")]
     ]
+
+
+def installed() -> dict[str, str]:
+    """The drivers that installed packages offer, and this one by the same way."""
+    from countersteer.drivers import own
+
+    return {name: own.described(name) for name in own.installed()}
 
 
 def parameters(car: str | None) -> list[dict[str, Any]]:

@@ -29,6 +29,11 @@ def installed() -> list[str]:
     return sorted(point.name for point in importlib.metadata.entry_points(group=GROUP))
 
 
+def described(name: str) -> str:
+    """What an installed driver's class says of itself, in a line."""
+    return (inspect.getdoc(_installed(name)) or "").partition("\n")[0]
+
+
 def own_driver(name: str, course: Course, car: Car, speed: float | None, laps: int) -> Any:
     """The driver of a class that a person named.
 

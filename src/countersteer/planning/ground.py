@@ -1,7 +1,7 @@
 """A course as a planner needs it: tables in which a thousand cars at once look up their place."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,7 @@ from countersteer.errors import InputError
 from countersteer.signals import Array, Scalar
 
 SPACING = 0.02  # m between two points of the line
-ROUNDING = 0.2  # corridor widths: standard deviation by which the line's corners are rounded
+ROUNDING = 0.3  # corridor widths: standard deviation by which the line's corners are rounded
 AHEAD = 0.5  # corridor widths: so far ahead a corner's outgoing direction is looked for
 STRAIGHT_ON = 4.0  # m, by which an open course goes on before its start and behind its end
 CELL = 0.02  # m, of the grid of clearances
@@ -68,11 +68,11 @@ def ground_of(course: Course) -> Ground:
     width = course.width or 1.0
     points = _even(course)
     sigma = ROUNDING * width / SPACING
-    mode = "wrap" if course.closed else "nearest"
-    points = ndimage.gaussian_filter1d(points, sigma, axis=0, mode=mode)
     if course.closed:
+        points = ndimage.gaussian_filter1d(points, sigma, axis=0, mode="wrap")
         steps = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
     else:
+        points = ndimage.gaussian_filter1d(points, sigma, axis=0, mode="nearest")
         steps = np.gradient(points, axis=0)
     bearing = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     lap = round((bearing[-1] - bearing[0]) / (2 * math.pi)) * 2 * math.pi if course.closed else 0.0
@@ -86,10 +86,11 @@ def ground_of(course: Course) -> Ground:
     clearance, corner, cell = _clearances(course, points)
     columns = (*points.T, np.cos(bearing), np.sin(bearing), bend, np.cos(out), np.sin(out))
     rows = math.ceil(len(points) / TABLE) * TABLE
-    padded = (np.append(c, np.full(rows - len(c), c[-1])).astype(np.float32) for c in columns)
+    tables = [np.append(c, np.full(rows - len(c), c[-1])).astype(np.float32) for c in columns]
     whole = np.int32(len(points) if course.closed else 0)
-    place = np.float32(corner[0]), np.float32(corner[1]), np.float32(cell)
-    return Ground(*padded, np.int32(len(points) - 1), whole, clearance.astype(np.float32), *place)
+    grid = clearance.astype(np.float32), *map(np.float32, (*corner, cell))
+    parts: list[Any] = [*tables, np.int32(len(points) - 1), whole, *grid]
+    return Ground(*parts)
 
 
 def start_of(course: Course, ground: Ground) -> float:

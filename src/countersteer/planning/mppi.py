@@ -31,7 +31,7 @@ from countersteer.world import plant
 KNOT = 0.02  # s for which a command is held: one decision
 HORIZON = 0.8  # s
 KNOTS = round(HORIZON / KNOT)
-STEP = 0.005  # s of the plant
+STEP = 0.01  # s of the plant
 SAMPLES = 1000
 
 
@@ -47,12 +47,13 @@ class Costs(NamedTuple):
     facing: float = 2.0  # behind the goal: of 1 - cos(heading off the line)
     clearance: float = 20.0  # of the square of how far a corner comes within `margin`, over it
     hit: float = 30.0  # of the time with a corner beyond a wall
-    sideslip: float = 1.0  # in corners: of how far the sideslip is from `drift`, over it
+    sideslip: float = 1.0  # of the square of how far the sideslip is from what it should be
+    straight: float = 0.3  # the part of that on straights, where it should be 0
     overshoot: float = 4.0  # of the square of the heading beyond the corner's way out, rad²
     smoothness: float = 0.05  # of the square of the change of a command, in full commands, a knot
-    backwards: float = 2.0  # of the part of the velocity against the line, over its size
+    backwards: float = 3.0  # of going, and of facing, against the line
     margin: float = 0.08  # m
-    drift: float = math.radians(36)
+    drift: float = math.radians(36)  # what the sideslip should be in corners
 
 
 class Search(NamedTuple):
@@ -85,6 +86,7 @@ class Memory(NamedTuple):
     given: Command  # (HISTORY,) the last commands, the newest last
 
 
+MOST_SLIP = 9.0  # of that square
 HISTORY = 16  # knots; a longer pure delay is cut off
 SEEN = ("x", "y", "heading", "vx", "vy", "yaw_rate")
 
@@ -128,34 +130,37 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
     hit = jnp.cumsum(jnp.where(nearest <= 0, 1.0, 0.0)) > 0
 
     bend = ground.bend[row]
-    slip = -bend * jnp.arctan2(motion.vy, jnp.maximum(motion.vx, 0.1))  # positive: nose in
-    shy = jnp.abs(bend) * jnp.clip(1 - slip / costs.drift, 0.0, 2.0)
+    speed = jnp.sqrt(motion.vx**2 + motion.vy**2) + 0.1
+    # Nose in, by `drift`, in a corner; straight elsewhere.
+    off = (jnp.arctan2(motion.vy, motion.vx) + bend * costs.drift) / costs.drift
+    weight = jnp.where(bend == 0, costs.straight, 1.0) * jnp.minimum(speed, 1.0)
+    slips = weight * jnp.minimum(off**2, MOST_SLIP)
     out_x, out_y = ground.out_x[row], ground.out_y[row]
     beyond = jnp.arctan2(out_x * sine - out_y * cosine, out_x * cosine + out_y * sine)
     over = jnp.maximum(bend * beyond, 0.0) ** 2
-    speed = jnp.sqrt(motion.vx**2 + motion.vy**2) + 0.1
     east, north = cosine * motion.vx - sine * motion.vy, sine * motion.vx + cosine * motion.vy
     forward = (east * ground.along_x[row] + north * ground.along_y[row]) / speed
-    turned = 1 - cosine * ground.along_x[row] - sine * ground.along_y[row]
+    facing = cosine * ground.along_x[row] + sine * ground.along_y[row]
+    against = jnp.maximum(0.3 - forward, 0.0) + jnp.maximum(0.2 - facing, 0.0)
     changes = jnp.diff(commands.throttle) ** 2 + (jnp.diff(commands.steering) / problem.lock) ** 2
     arrived = jnp.where(places > problem.goal, 1.0, 0.0)
     left = jnp.minimum(end, problem.goal) - jnp.minimum(place, problem.goal)
     return (
         -costs.progress * left
-        + jnp.mean(arrived * (costs.speed * speed + costs.facing * turned - costs.goal))
+        + jnp.mean(arrived * (costs.speed * speed + costs.facing * (1 - facing) - costs.goal))
         + costs.clearance * jnp.mean(close)
         + costs.hit * jnp.mean(jnp.where(hit, 1.0, 0.0))
-        + costs.sideslip * jnp.mean(shy)
+        + costs.sideslip * jnp.mean(slips)
         + costs.overshoot * jnp.mean(over)
         + costs.smoothness * jnp.sum(changes)
-        + costs.backwards * jnp.mean(jnp.maximum(0.3 - forward, 0.0))
+        + costs.backwards * jnp.mean(against)
     )
 
 
 def draw(problem: Problem, key: Array, plan: Command, samples: int) -> Command:
     """Sequences of commands (samples, KNOTS) around a plan. The first is the plan itself."""
     search = problem.search
-    normal = jax.random.normal(key, (2, samples, KNOTS), jnp.float32)
+    normal = jax.random.normal(key, (2, samples, KNOTS + 1), jnp.float32)
     normal = normal.at[:, 0].set(0.0)
     fresh = jnp.sqrt(1 - search.lasting**2)
 
@@ -163,7 +168,7 @@ def draw(problem: Problem, key: Array, plan: Command, samples: int) -> Command:
         now = search.lasting * before + fresh * new
         return now, now
 
-    _, noise = jax.lax.scan(follow, normal[:, :, 0], normal.transpose(2, 0, 1))
+    _, noise = jax.lax.scan(follow, normal[:, :, 0], normal[:, :, 1:].transpose(2, 0, 1))
     throttle = plan.throttle + search.throttle * noise[:, 0].T
     steering = plan.steering + search.steering * problem.lock * noise[:, 1].T
     return Command(jnp.clip(throttle, -1.0, 1.0), jnp.clip(steering, -problem.lock, problem.lock))
@@ -215,8 +220,8 @@ class Mppi:
         car: Car,
         laps: int = 1,
         *,
-        costs: Costs = Costs(),  # noqa: B008  # it cannot change
-        search: Search = Search(),  # noqa: B008
+        costs: Costs = Costs(),  # noqa: B008  # it is immutable
+        search: Search = Search(),  # noqa: B008  # so is this
         samples: int = SAMPLES,
     ) -> None:
         """For a course with a centre line and the nominal car. Raises `InputError`."""
@@ -245,8 +250,8 @@ class Mppi:
 
     def reset(self, key: Array) -> Memory:
         """At rest at the start, with no throttle planned."""
-        zero = 0.0
-        motion = Motion(*self._start, zero, zero, zero, Wheels(*[zero] * 4), *[zero] * 4, 1.0)
+        parts: list[Any] = [*self._start, *[0.0] * 3, Wheels(*[0.0] * 4), *[0.0] * 4, 1.0]
+        motion = Motion(*parts)
         none = Command(np.zeros(KNOTS), np.zeros(KNOTS))
         given = Command(np.zeros(HISTORY), np.zeros(HISTORY))
         memory: Memory = self._put(
