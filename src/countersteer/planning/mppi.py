@@ -210,7 +210,7 @@ def decide(
 
 
 class Mppi:
-    """The driver `mppi`. It needs a pose: `--estimate pose` or `truth`."""
+    """Plans with the car's model 50 times a second (MPPI), on `--estimate truth` or `pose`."""
 
     period = KNOT
 
