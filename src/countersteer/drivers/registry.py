@@ -42,7 +42,9 @@ def make_driver(
             raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
         return replay(read(Path(name))), {"kind": "replay"}
     tables: dict[str, Any] = {} if speed is None else {"speed_mps": speed}
-    if own.is_code(name) or name in own.installed():
+    # Looking for what is installed takes longer than making a driver of the library.
+    theirs = name not in DRIVERS and not name.endswith(".toml") and name in own.installed()
+    if own.is_code(name) or theirs:
         return own.own_driver(name, course, car, speed, laps), {"kind": "python", "name": name}
     if name in ("straighten", "pursuit"):
         tables = {"kind": name, **tables}
