@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car, Tires
-from countersteer.car.parameter import declarations
+from countersteer.car.parameter import changed, declarations
 from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
 from countersteer.signals import Command, Motion, Wheels
@@ -96,7 +96,7 @@ def draw(law: str, walls: np.ndarray, rng: np.random.Generator, count: int) -> S
         if path.partition(".")[0] in PHYSICS:
             drawn = rng.random(count) < share
             value = np.where(drawn, draw_values(low, high, rng, count), default)
-            car = with_value(car, path, value)
+            car = changed(car, path, value)
     # Between parameters, as `car.files.check`.
     body, motor = car.body, car.motor
     front = np.minimum(body.front_axle, 0.99 * body.wheelbase)
@@ -135,13 +135,6 @@ def places(walls: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarra
         return rng.uniform(-1, 1, (count, 2))
     low, high = walls.reshape(-1, 2).min(axis=0) - 0.5, walls.reshape(-1, 2).max(axis=0) + 0.5
     return rng.uniform(low, high, (count, 2))
-
-
-def with_value(part: Any, path: str, value: Any) -> Any:
-    """`part` with one parameter replaced."""
-    name, _, rest = path.partition(".")
-    inner = with_value(getattr(part, name), rest, value) if rest else value
-    return dataclasses.replace(part, **{name: inner})
 
 
 def value_of(part: Any, path: str) -> Any:
@@ -251,7 +244,7 @@ def minimised(start: Start, walls: np.ndarray, bits: int, kind: str) -> tuple[St
 
     car, left = start.car, [p for p in paths if value_of(start.car, p) != ranges[p][0]]
     while left:
-        tried = [with_value(car, path, np.float64(ranges[path][0])) for path in left]
+        tried = [changed(car, path, np.float64(ranges[path][0])) for path in left]
         tried += [car] * (len(paths) - len(tried))  # one shape: one program
         able = fails(tried)[: len(left)]
         if not able.any():

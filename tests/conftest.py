@@ -1,6 +1,5 @@
 """What the tests share: 64-bit floats, JAX's cache on disk, and programs that compile once."""
 
-import gc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from countersteer import kept_programs
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
 from countersteer.compiling import configure_jax
@@ -43,15 +41,6 @@ configure_jax()  # before anything computes: it sets how to compile
 def session() -> Iterator[None]:
     with jax.enable_x64(True):
         yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def programs() -> Iterator[None]:
-    """Each file's compiled programs go with it: hundreds in one process have crashed XLA 0.10.2."""
-    yield
-    jax.clear_caches()
-    kept_programs.forget()
-    gc.collect()
 
 
 class Drive(NamedTuple):

@@ -225,10 +225,7 @@ def run_with(folder: Path, changes: dict[str, str]) -> Path:
     ],
 )
 def test_a_wrong_key_of_run_toml_is_named(tmp_path, text, says):
-    folder = run_with(tmp_path / "run", {"run.toml": text})
-    told = refusal(read_run, folder)
-    assert f"{folder}/run.toml: " in told
-    assert says in told
+    refused_in_a_run(tmp_path / "run", "run.toml", text, says)
 
 
 @pytest.mark.parametrize(
@@ -247,9 +244,12 @@ def test_a_wrong_key_of_run_toml_is_named(tmp_path, text, says):
     ],
 )
 def test_a_wrong_summary_is_refused(tmp_path, text, says):
-    folder = run_with(tmp_path / "run", {"summary.json": text})
-    told = refusal(read_run, folder)
-    assert f"{folder}/summary.json: " in told
+    refused_in_a_run(tmp_path / "run", "summary.json", text, says)
+
+
+def refused_in_a_run(folder, name, text, says):
+    told = refusal(read_run, run_with(folder, {name: text}))
+    assert f"{folder}/{name}: " in told
     assert says in told
 
 

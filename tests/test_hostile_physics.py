@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from countersteer.car.files import load_car
+from countersteer.car.parameter import changed
 from countersteer.course.files import load_course
 from countersteer.signals import Command, Motion, Wheels
 from countersteer.world import planar, tyre
@@ -36,7 +37,7 @@ def test_the_checks_of_the_study_find_what_they_look_for() -> None:
     vx[:, 2], vx[:, 3] = [1.0, 1.0, 1.1], [1.0, 0.9, 0.9]
     vy, yaw_rate = np.zeros_like(x), np.zeros_like(x)
     moved = still._replace(x=x, y=y, heading=heading, vx=vx, vy=vy, yaw_rate=yaw_rate)
-    body = fuzz_physics.with_value(start.car, "body.center", np.zeros(4))
+    body = changed(start.car, "body.center", np.zeros(4))
     found = fuzz_physics.failures(start._replace(car=body), moved, BOX, 64)
     assert found["not finite"].tolist() == [1, 0, 0, 0]
     assert found["wall passed"].tolist()[1:] == [1, 0, 0]
@@ -80,7 +81,7 @@ def test_a_guarded_tick_adds_no_energy_where_the_change_dwarfs_the_motion() -> N
 def test_the_chord_of_a_magic_formula_only_removes_energy(shift: float) -> None:
     rng = np.random.default_rng(3)
     tire = load_car("rx7", ["tires.rear.law=magic-formula"]).tires.rear
-    tire = fuzz_physics.with_value(tire, "magic_formula.p_hx1", np.float64(0.1 * shift))
+    tire = changed(tire, "magic_formula.p_hx1", np.float64(0.1 * shift))
     slip_x, slip_y, rim = rng.normal(size=(3, 500)) * 10.0 ** rng.uniform(-6, 1, (3, 500))
     found = jax.vmap(lambda x, y, r: tyre.contact(tire, 5.0, x, y, r))(slip_x, slip_y, rim)
     assert np.all(found.k_x >= 0)
@@ -100,8 +101,8 @@ def test_a_combined_loss_without_a_peak_at_zero_stays_finite() -> None:
 
 
 def test_a_wheel_that_ackermann_turns_beyond_90_degrees_has_a_direction() -> None:
-    servo = fuzz_physics.with_value(load_car("rx7").servo, "ackermann", np.float64(1.5))
-    body = fuzz_physics.with_value(load_car("rx7").body, "track", np.float64(3.0))
+    servo = changed(load_car("rx7").servo, "ackermann", np.float64(1.5))
+    body = changed(load_car("rx7").body, "track", np.float64(3.0))
     for steering in np.linspace(-1.3, 1.3, 101):
         for cosine, sine in planar.servo.directions(body, servo, steering):
             assert np.hypot(cosine, sine) == pytest.approx(1.0)
@@ -160,7 +161,7 @@ def test_a_hit_of_a_heavy_car_with_little_yaw_inertia_adds_no_energy_in_32_bits(
         "wall_friction": rng.uniform(0, 10, count),
         "wall_restitution": rng.uniform(0, 1, count),
     }.items():
-        body = fuzz_physics.with_value(body, name, values.astype(np.float32))
+        body = changed(body, name, values.astype(np.float32))
     start = fuzz_physics.draw("brush", BOX, rng, count).motion
     start = jax.tree.map(np.float32, start)
     walls = padded(BOX, np.dtype(np.float32))

@@ -17,7 +17,6 @@ import hashlib
 import importlib
 import json
 import threading
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
@@ -43,9 +42,6 @@ PATIENCE = 20.0  # s; a program that another thread loads for longer is loaded h
 PACKAGE = "countersteer"
 
 
-_all: "weakref.WeakSet[Kept]" = weakref.WeakSet()
-
-
 class Kept:
     """A pure function, as `jax.jit` would have it; `static` are the positions of static arguments.
 
@@ -61,12 +57,6 @@ class Kept:
         self._last: tuple[Any, list[Any], _Program] | None = None
         self._lock = threading.Lock()
         functools.update_wrapper(self, function)
-        _all.add(self)
-
-    def forget(self) -> None:
-        """Lets go of the programs that this process holds; those on the disk stay."""
-        self._programs.clear()
-        self._last = None
 
     def __call__(self, *arguments: Any) -> Any:
         """The function's result."""
@@ -145,12 +135,6 @@ def kept(*static: int) -> Callable[[Callable[..., Any]], Kept]:
 # Programs that another thread loads, by key and device, and all that this process has used.
 _coming: dict[tuple[str, Any], Future[Any]] = {}
 _used: list[dict[str, Any]] = []
-
-
-def forget() -> None:
-    """`Kept.forget` for all."""
-    for one in _all:
-        one.forget()
 
 
 def preload(what: str) -> None:
