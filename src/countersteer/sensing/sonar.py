@@ -1,19 +1,27 @@
 """Sonar: the nearest echo in a wide cone."""
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Sonar
-from countersteer.signals import Scalar
+from countersteer.signals import Array, Scalar
 
 PAST = 1e-5  # rad by which a ray passes the end of a wall
 INSIDE = 1e-3  # m, margin between an echo's point and the end of a wall
 MERGED = 1e-4  # m, distance within which ends of walls are one corner
 FEW = 1000  # points whose distances are all computed
 MOST_WALLS = 24  # walls of a ping: the nearest ones in its cone
+
+
+class Flat(NamedTuple):
+    """Vectors in the plane, each coordinate an array of its own."""
+
+    x: Array
+    y: Array
 
 
 def edges(walls: np.ndarray) -> np.ndarray:
@@ -114,23 +122,23 @@ def _echo(
         near = _nearest(sonar, walls, x, y, bearing)
         both = jnp.concatenate([near, near + walls.shape[0]])
         walls, corners, lit = walls[near], corners[both], lit[both]
-    start, end = walls[:, :2] - jnp.stack([x, y]), walls[:, 2:] - jnp.stack([x, y])
-    length = jnp.sqrt(jnp.sum((end - start) ** 2, axis=1) + 1e-18)
-    along = (end - start) / length[:, None]
-    foot = -jnp.sum(start * along, axis=1)  # along the wall, from its start
-    away = jnp.abs(start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0])
+    # Each coordinate is an array of its own, with x forward and y left of the sonar: a batch of
+    # pairs would not fill the vector units.
+    start, end = (_from(walls[:, i], walls[:, i + 1], x, y, bearing) for i in (0, 2))
+    edge = _from(corners[:, 0], corners[:, 1], x, y, bearing)
+    step = Flat(end.x - start.x, end.y - start.y)
+    length = _length(step)
+    along = Flat(step.x / length, step.y / length)
+    foot = -(start.x * along.x + start.y * along.y)  # along the wall, from its start
+    away = jnp.abs(_cross(start, along))
     # The piece of the wall's line that is seen within `obliqueness` of its normal.
     low, high = foot - away * jnp.tan(sonar.obliqueness), foot + away * jnp.tan(sonar.obliqueness)
-    normal = start + foot[:, None] * along  # from the sonar to the foot
-    ahead_foot = jnp.cos(bearing) * normal[:, 0] + jnp.sin(bearing) * normal[:, 1]
-    aside_foot = jnp.cos(bearing) * normal[:, 1] - jnp.sin(bearing) * normal[:, 0]
-    ahead_step = jnp.cos(bearing) * along[:, 0] + jnp.sin(bearing) * along[:, 1]
-    aside_step = jnp.cos(bearing) * along[:, 1] - jnp.sin(bearing) * along[:, 0]
+    normal = Flat(start.x + foot * along.x, start.y + foot * along.y)  # from sonar to foot
     slope = jnp.tan(sonar.half_angle)
-    # Within the cone, slope · ahead -+ aside >= 0. Both are linear along the wall.
+    # Within the cone, slope · x -+ y >= 0. Both are linear along the wall.
     for side in (1.0, -1.0):
-        at_foot = slope * ahead_foot + side * aside_foot
-        change = slope * ahead_step + side * aside_step
+        at_foot = slope * normal.x + side * normal.y
+        change = slope * along.x + side * along.y
         root = foot - at_foot / jnp.where(jnp.abs(change) > 1e-9, change, 1e-9)
         low = jnp.where(change > 0, jnp.maximum(low, root), low)
         high = jnp.where(change > 0, high, jnp.minimum(high, root))
@@ -138,27 +146,32 @@ def _echo(
     # Not the very end: where two walls meet, the end of a hidden wall would be visible.
     inner = jnp.minimum(INSIDE, (high - low) / 2)
     at = jnp.clip(foot, low + inner, high - inner)
-    point = start + at[:, None] * along
+    point = Flat(start.x + at * along.x, start.y + at * along.y)
+    within = edge.x > _length(edge) * jnp.cos(sonar.half_angle)
+    points = _joined(point, edge)
+    seen = jnp.concatenate([low <= high, (lit > 0) & within]) & ~_hidden(start, step, points)
+
     # If that point is hidden, the wall may still be visible past the end of the nearer wall.
-    ends = jnp.concatenate([start, end])
-    past = jnp.concatenate([ends + PAST * _left(ends), ends - PAST * _left(ends)])
-    span = _cross(past[:, None], (end - start)[None])
-    scale = _cross(start, end - start)[None] / jnp.where(jnp.abs(span) > 1e-12, span, jnp.inf)
-    glimpse = scale[..., None] * past[:, None]
-    place = jnp.sum((glimpse - start) * along, axis=-1)
-    beyond = jnp.sum((glimpse - jnp.concatenate([ends, ends])[:, None]) ** 2, axis=-1)
-    glimpsed = (scale > 0) & (place >= low) & (place <= high) & (beyond > INSIDE**2)
-    points = jnp.concatenate([point, glimpse.reshape(-1, 2), corners - jnp.stack([x, y])])
-    reach = jnp.sqrt(jnp.sum(points**2, axis=1) + 1e-18)
-    ahead = jnp.cos(bearing) * points[:, 0] + jnp.sin(bearing) * points[:, 1]
-    within = ahead > reach * jnp.cos(sonar.half_angle)
-    seen = jnp.concatenate(
-        [low <= high, glimpsed.reshape(-1), (lit > 0) & within[-corners.shape[0] :]]
-    )
-    seen = seen & ~_hidden(start, end, points)
-    reach = jnp.where(seen, reach, jnp.inf)
+    ends = _joined(start, end)
+    past = _joined(*(Flat(ends.x - p * ends.y, ends.y + p * ends.x) for p in (PAST, -PAST)))
+    scale, on_wall = _crossings(start, step, past)
+    place = on_wall * length
+    beyond = jnp.abs(scale - 1) * _length(past)[:, None]
+    echoes = (scale > 0) & (place >= low) & (place <= high) & (beyond > INSIDE)
+    # The ray ends at the first wall that it meets, whether that wall returns an echo or not.
+    met = (scale > 1e-6) & (on_wall >= 0) & (on_wall <= 1)
+    first = jnp.min(jnp.where(met, scale, jnp.inf), axis=1, keepdims=True)
+    echoes = echoes & (scale * (1 - 1e-4) <= first)
+    glimpse = jnp.min(jnp.where(echoes, scale, jnp.inf), axis=1)
+    glimpsed = jnp.isfinite(glimpse)
+    part = jnp.where(glimpsed, glimpse, 1.0)
+    points = _joined(points, Flat(part * past.x, part * past.y))
+
+    reach = jnp.where(jnp.concatenate([seen, glimpsed]), _length(points), jnp.inf)
     nearest = jnp.argmin(reach)
-    return reach[nearest], x + points[nearest, 0], y + points[nearest, 1]
+    cosine, sine = jnp.cos(bearing), jnp.sin(bearing)
+    ahead, aside = points.x[nearest], points.y[nearest]
+    return reach[nearest], x + cosine * ahead - sine * aside, y + sine * ahead + cosine * aside
 
 
 def _nearest(sonar: Sonar, walls: jax.Array, x: Scalar, y: Scalar, bearing: Scalar) -> jax.Array:
@@ -180,20 +193,39 @@ def _nearest(sonar: Sonar, walls: jax.Array, x: Scalar, y: Scalar, bearing: Scal
     return jnp.sort(jax.lax.top_k(jnp.where(inside, -away, -jnp.inf), MOST_WALLS)[1])
 
 
-def _left(vector: jax.Array) -> jax.Array:
-    """The vectors, turned by 90° to the left."""
-    return jnp.stack([-vector[..., 1], vector[..., 0]], axis=-1)
+def _from(x: Array, y: Array, at_x: Scalar, at_y: Scalar, bearing: Scalar) -> Flat:
+    """Points as seen from a place: x along the bearing, y to its left."""
+    dx, dy, cosine, sine = x - at_x, y - at_y, jnp.cos(bearing), jnp.sin(bearing)
+    return Flat(cosine * dx + sine * dy, cosine * dy - sine * dx)
 
 
-def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """The cross product of two vectors in the plane."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _joined(*parts: Flat) -> Flat:
+    """All vectors of some arrays, in their order."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def _hidden(start: jax.Array, end: jax.Array, points: jax.Array) -> jax.Array:
+def _length(vector: Flat) -> Array:
+    """The lengths of vectors."""
+    return jnp.sqrt(vector.x**2 + vector.y**2 + 1e-18)
+
+
+def _cross(a: Flat, b: Flat) -> Array:
+    """The cross product of vectors in the plane."""
+    return a.x * b.y - a.y * b.x
+
+
+def _crossings(start: Flat, step: Flat, rays: Flat) -> tuple[Array, Array]:
+    """Where rays (m) from the origin cross the lines of walls (n).
+
+    Two arrays (m, n): the place as a part of the ray, and as a part of the wall.
+    """
+    ray = Flat(rays.x[:, None], rays.y[:, None])
+    span = _cross(ray, step)
+    over = jnp.where(jnp.abs(span) > 1e-12, 1 / span, 0.0)
+    return _cross(start, step) * over, _cross(start, ray) * over
+
+
+def _hidden(start: Flat, step: Flat, points: Flat) -> Array:
     """True for points that a wall hides from the origin. A wall does not hide points on it."""
-    ray, a, b = points[:, None], start[None], end[None]
-    span = _cross(ray, b - a)
-    safe = jnp.where(jnp.abs(span) > 1e-12, span, jnp.inf)
-    on_ray, on_wall = _cross(a, b - a) / safe, _cross(a, ray) / safe
+    on_ray, on_wall = _crossings(start, step, points)
     return jnp.any((on_ray > 1e-6) & (on_ray < 1 - 1e-4) & (on_wall >= 0) & (on_wall <= 1), axis=1)
