@@ -7,7 +7,7 @@ READY := .venv/ready
 # What a drive needs; `make test` and the rest add to it. Modules are compiled when they are imported.
 DRIVES := .venv/drives
 
-.PHONY: drive test check accuracy recovery estimation hostile bench notebook clean
+.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook clean
 
 drive: $(DRIVES)
 	$(BIN)/countersteer drive box
@@ -30,6 +30,10 @@ recovery: $(READY)
 # Some twenty programs to compile, then 256 cars in each: ten minutes or more on two cores.
 estimation: $(READY)
 	$(BIN)/python -m studies.estimation docs/estimation.md
+
+# Corners of 60 to 180° to both hands, 500 cars each: a table, in a few minutes.
+corners: $(READY)
+	$(BIN)/python -m studies.corners
 
 # Random cars, damaged files and killed commands: half an hour on two cores.
 hostile: $(READY)

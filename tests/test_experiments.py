@@ -14,6 +14,7 @@ from countersteer.drivers.drift_turn import SPIN, STRAIGHT
 from countersteer.drivers.driver import Status
 from countersteer.drivers.played_turn import PlayedTurn
 from countersteer.experiments import (
+    action_spread,
     battery,
     control_rate,
     drift_threshold,
@@ -24,6 +25,7 @@ from countersteer.experiments import (
 )
 from countersteer.experiments.open_turns import Series
 from countersteer.experiments.result import write
+from countersteer.planning.mppi import KNOT
 from countersteer.runs.run import read_run
 from countersteer.signals import Command
 from test_open_turns import LANES, TIME, slowing, write_run
@@ -133,6 +135,32 @@ def test_wide_corners_are_passed_by_grip_and_by_drift_and_a_slit_by_none(car):
         length = np.hypot(*np.diff(wide.track[:2], axis=1)).sum()
         assert 1.5 < length < 2.6
         assert wide.track[2, -1] == pytest.approx(math.pi / 2, abs=math.radians(30))
+
+
+def test_keys_are_full_or_none_and_a_novice_presses_them_late():
+    rng = np.random.default_rng(0)
+    given = Command(np.array([0.0, 0.2, 0.5, -0.9]), np.array([0.4, 0.1, -0.3, -0.01]))
+    keys = action_spread.as_keys(given, 0.5)
+    assert keys.throttle.tolist() == [0, 0, 1, -1]
+    assert keys.steering.tolist() == [0.5, 0, -0.5, 0]
+    line = np.repeat([0.0, 1.0, 0.0, -1.0], 20)
+    for _ in range(20):
+        late = action_spread.late(line, rng)
+        on_time, after = (np.nonzero(np.diff(x))[0] for x in (line, late))
+        delays = KNOT * (after - on_time[: len(after)])
+        assert np.all(delays >= 0)
+        assert np.all(delays < action_spread.LATE + 5 * action_spread.SCATTER)
+        assert late[0] == line[0]
+
+
+def test_the_best_commands_take_a_corner_and_keys_do_worse(car):
+    """Small: eight cars for each kind, and a search of a few rounds."""
+    found = action_spread.simulate(car, "rx7", cars=8, rounds=12)
+    figures = found.figures
+    assert figures["optimum"]["through_share"] > figures["novice"]["through_share"]
+    assert figures["optimum"]["peak_sideslip_deg_median"] > 15
+    assert list(found.table["commands"]) == list(action_spread.KINDS)
+    assert "optimum" in found.text
 
 
 class Inner(NamedTuple):

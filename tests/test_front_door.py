@@ -118,7 +118,7 @@ def test_what_is_learned_stays_within_the_declared_ranges(monkeypatch):
 
     monkeypatch.setattr(learning, "drive", drive)
     with pytest.raises(StopIteration):
-        learning.search([None], None, None, library(), 1, 64, 4, 10.0)
+        learning.search([load_course("box")], None, None, library(), 1, 64, 4, 10.0)
     low, high = learning.ranges(library())
     numbers = np.array([learning.flat(policy) for policy in tried])
     assert np.all((numbers >= low) & (numbers <= high))

@@ -45,6 +45,7 @@ MAY_IMPORT = {
     "experiments": {
         "car", "course", "world", "link", "estimation", "pilot", "simulator", "task", "runs",
         "batch", "tuning", "drivers",
+        "planning",  # what the planner and the optimum can do
     },
     "bench": {
         "car", "course", "world", "pilot", "simulator", "batch",

@@ -11,7 +11,7 @@ from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.errors import InputError
 from countersteer.pilot import Pilot
-from countersteer.planning import mppi
+from countersteer.planning import mppi, optimum
 from countersteer.planning.ground import SPACING, ground_of, start_of
 from countersteer.planning.mppi import KNOTS, Costs, Mppi, Problem, Search
 from countersteer.signals import Command, Motion, Wheels
@@ -153,3 +153,26 @@ def test_it_laps_the_box_in_a_drift() -> None:
     assert score.wall_contacts == 0
     assert score.goal_time < 5.0
     assert np.sum(score.turns.peak_sideslip > math.radians(25)) >= 2
+
+
+def test_changes_of_a_plan_stay_within_its_limits_and_the_first_is_the_plan() -> None:
+    own = problem()
+    plan = Command(jnp.linspace(-1.0, 1.0, 60), jnp.linspace(0.4, -0.4, 60))
+    drawn = optimum.changed(own, jax.random.key(1), plan, 256)
+    for line, lines, limit in zip(plan, drawn, (1.0, float(own.lock)), strict=True):
+        assert np.allclose(lines[0], line, atol=1e-6)
+        assert np.all(np.abs(lines) <= limit + 1e-6)
+        assert np.mean(np.any(np.abs(lines - line) > 1e-3, axis=1)) > 0.5
+    # Some change throttle and steering apart.
+    moved = [np.any(np.abs(b - a) > 1e-6, axis=1) for a, b in zip(plan, drawn, strict=True)]
+    assert np.any(moved[0] & ~moved[1])
+    assert np.any(moved[1] & ~moved[0])
+
+
+def test_a_plan_may_hold_a_command_throughout() -> None:
+    own = problem()
+    drawn = mppi.draw(own, jax.random.key(0), resting(), 64)
+    held = np.asarray(mppi.HELD)
+    assert np.allclose(drawn.throttle[-len(held) :], held[:, :1])
+    assert np.allclose(drawn.steering[-len(held) :], own.lock * held[:, 1:])
+    assert np.allclose(drawn.throttle[0], 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from countersteer.drivers.policy import TABLES, load_policy, policy_tables, save_policy
+from countersteer.drivers.policy import LIBRARY, TABLES, load_policy, policy_tables, save_policy
 from countersteer.drivers.registry import make_driver
 from countersteer.drivers.stop_angle import StopAngle
 from countersteer.errors import InputError
@@ -90,3 +90,13 @@ def test_a_policy_drives_by_its_own_numbers(tmp_path):
     assert own.hold_p == load_policy("drift-turn").turning.hold_p != 1.9
     with pytest.raises(InputError, match="cannot be read"):
         make_driver("none.toml", course, car, None, 1, read_commands)
+
+
+def test_a_single_number_holds_at_all_speeds(tmp_path):
+    """Files from before a number went by speed still read."""
+    text = (LIBRARY / "drift-turn.toml").read_text()
+    begin = text.index("slip_aim_deg = ")
+    old = text[:begin] + "slip_aim_deg = 30.0\n" + text[text.index("]", begin) + 2 :]
+    (tmp_path / "old.toml").write_text(old)
+    read = load_policy(str(tmp_path / "old.toml")).turning
+    assert read.slip_aim == pytest.approx(np.full(len(read.speeds), math.radians(30)))

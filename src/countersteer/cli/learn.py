@@ -5,8 +5,14 @@ import json
 import math
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from countersteer.cli.options import DONE, Verbs, number, out_file
+from countersteer.cli.options import DONE, Progress, Verbs, number, out_file
+
+if TYPE_CHECKING:
+    from countersteer.learning.turning import Verdict
+
+UNSEEN = 10_000_000  # first seed of the trials that judge what was learned
 
 
 def add(verbs: Verbs) -> None:
@@ -26,13 +32,22 @@ def add(verbs: Verbs) -> None:
     turn.option("--car", None, str, "rx7", "the nominal one")
     turn.option("--cars", "SET", str, "around", "as for evaluate")
     turn.option("--begin", "POLICY", str, "drift-turn", "where the search begins")
-    turn.option("--generations", "N", number(1, 1000, int), 30, "steps of the search")
-    turn.option("--candidates", "N", number(4, 1024, int), 32, "policies tried in each of them")
-    turn.option("--trials", "N", number(1, 1024, int), 48, "random cars that each policy drives")
+    turn.option("--generations", "N", number(1, 1000, int), 20, "steps of the search")
+    turn.option("--candidates", "N", number(4, 1024, int), 24, "policies tried in each of them")
+    turn.option("--trials", "N", number(1, 1024, int), 56, "random cars that each policy drives")
     meaning = "how far it looks at first: 1 for another car, 0.2 to polish"
     turn.option("--spread", "X", number(0.001, 10), 0.5, meaning)
     turn.seed()
     turn.out_file("POLICY.toml", "policy")
+
+    does = "the best open-loop commands for a car that is wholly known: a yardstick for drivers"
+    best = learn("optimum", does, run_optimum)
+    best.add_argument("course", metavar="COURSE", help="as for drive")
+    best.option("--car", None, str, "rx7", "the nominal one")
+    best.option("--laps", None, number(1, 100, int), 1, "laps, where the course is closed")
+    best.option("--rounds", "N", number(1, 100_000, int), 600, "of the search; 0.4 s each or more")
+    best.seed()
+    best.out_file("COMMANDS.csv", "list of commands")
 
 
 def run_stop_angle(options: argparse.Namespace) -> int:
@@ -75,7 +90,7 @@ def learn_turn(options: argparse.Namespace) -> int:
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import load_policy, save_policy
-    from countersteer.learning.turning import Generation, search
+    from countersteer.learning.turning import Generation, search, verdict
 
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     courses = [load_course(name) for name in options.courses]
@@ -85,15 +100,16 @@ def learn_turn(options: argparse.Namespace) -> int:
         history.append(found._asdict())
         if not options.json:
             print(
-                f"  {number + 1:3}: cost {found.cost:.3f}, {100 * found.success_rate:.0f} % get "
-                f"round; best candidate {found.best_cost:.3f}",
+                f"  {number + 1:3} of {options.generations}: cost {found.cost:.3f}, "
+                f"{100 * found.success_rate:.0f} % get round; best candidate {found.best_cost:.3f}",
                 flush=True,
             )
 
+    car, population = load_car(options.car), load_population(options.cars)
     policy = search(
         courses,
-        load_car(options.car),
-        load_population(options.cars),
+        car,
+        population,
         load_policy(options.begin),
         options.generations,
         options.candidates,
@@ -110,6 +126,107 @@ def learn_turn(options: argparse.Namespace) -> int:
         *policy,
         car=Path(options.car).stem,
     )
-    result = {"policy": str(options.out), "generations": history}
-    print(json.dumps(result) if options.json else f"policy: {options.out}")
+    # Seeds that the search has not used.
+    found = verdict(courses, car, population, policy, (UNSEEN + options.seed) % 2**31)
+    told = _verdict_json(found)
+    if options.json:
+        print(json.dumps({"policy": str(options.out), "generations": history, "verdict": told}))
+        return DONE
+    if found.because is not None:
+        names = " and ".join(course.name for course in courses)
+        print(f"{Path(options.car).stem} cannot drift the corners of {names}: {found.because}")
+    print(
+        f"in {found.trials} new trials {100 * found.success_rate:.0f} % get round, "
+        f"{100 * found.drift_share:.0f} % of them with a drift in every turn"
+        + (
+            f": {told['peak_sideslip_deg_median']:.0f}° of sideslip, heading "
+            f"{told['heading_overshoot_deg_median']:.0f}° too far, {found.lap_time:.2f} s"
+            if found.success_rate
+            else ""
+        )
+    )
+    print(f"policy: {options.out}")
     return DONE
+
+
+def _verdict_json(found: "Verdict") -> dict[str, Any]:
+    """The verdict by the names of the JSON."""
+    plain = {
+        "trials": found.trials,
+        "success_rate": found.success_rate,
+        "drift_share": found.drift_share,
+        "peak_sideslip_deg_median": math.degrees(found.peak_sideslip),
+        "heading_overshoot_deg_median": math.degrees(found.overshoot),
+        "lap_time_s_median": found.lap_time,
+        "cannot_drift_because": found.because,
+    }
+    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in plain.items()}
+
+
+def run_optimum(options: argparse.Namespace) -> int:
+    """`learn optimum`."""
+    with out_file(options.out, ".csv"):
+        return learn_optimum(options)
+
+
+def learn_optimum(options: argparse.Namespace) -> int:
+    """The search for the best commands."""
+    import numpy as np
+
+    from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
+    from countersteer.course.files import load_course
+    from countersteer.experiments.best_drive import best, judged, planned
+    from countersteer.planning.mppi import KNOT
+    from countersteer.runs.files import COMMANDS, command_rows, csv_text
+    from countersteer.writing import write_whole
+
+    configure_jax(blocks=True, cores=os.cpu_count() or 1)
+    course, car, laps = load_course(options.course), load_car(options.car), options.laps
+    course.check_laps(laps)
+    if not options.json:
+        print("the planner drives first, some twenty seconds a lap", flush=True)
+    begin = planned(course, car, laps)
+
+    with Progress(options.json) as progress:
+        found = best(
+            course,
+            car,
+            begin,
+            options.rounds,
+            laps,
+            seed=options.seed,
+            report=lambda done, _: progress.show(done, options.rounds),
+        )
+    times = KNOT * np.arange(len(found.commands.throttle))
+    rows = command_rows(times, found.commands.throttle, found.commands.steering)
+    write_whole(options.out, csv_text(COMMANDS, rows))
+    result = {
+        "course": course.name,
+        "car": options.car,
+        "rounds": options.rounds,
+        "seed": options.seed,
+        "cost": found.cost,
+        "planner": judged(course, car, begin, laps),
+        "optimum": judged(course, car, found.commands, laps),
+    }
+    write_whole(options.out.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+    if options.json:
+        print(json.dumps(result | {"commands": str(options.out)}))
+        return DONE
+    for who in ("planner", "optimum"):
+        print(f"  {who}: {_in_words(result[who])}")
+    print(
+        f"commands: {options.out}; to see them: "
+        f"countersteer drive {options.course} --car {options.car} --driver {options.out}"
+    )
+    return DONE
+
+
+def _in_words(drive: dict[str, Any]) -> str:
+    """The judge's summary of a drive, in a line."""
+    lap, turns = drive["lap_time_s"], drive["turns"]
+    slips = ", ".join(f"{turn['peak_sideslip_deg']:.0f}°" for turn in turns)
+    over = ", ".join(f"{turn['heading_overshoot_deg']:.0f}°" for turn in turns)
+    time = drive["outcome"] if lap is None else f"{lap:.2f} s"
+    return f"{time}; sideslip {slips or 'none'}; heading too far {over or 'none'}"

@@ -74,13 +74,13 @@ class Parser(argparse.ArgumentParser):
 
 
 @contextlib.contextmanager
-def out_file(path: Path) -> Iterator[None]:
-    """Keep other processes from a `.toml` file and what is written beside it; make its folder.
+def out_file(path: Path, suffix: str = ".toml") -> Iterator[None]:
+    """Keep other processes from a file and what is written beside it; make its folder.
 
     Raises `InputError` if it has another name, or if nothing can be written there.
     """
-    if path.suffix != ".toml":
-        raise InputError(f"--out {path}: name a .toml file")
+    if path.suffix != suffix:
+        raise InputError(f"--out {path}: name a {suffix} file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

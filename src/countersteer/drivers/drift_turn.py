@@ -142,7 +142,7 @@ class DriftTurn:
         still = self.stop_angle.angle(speed, jnp.maximum(rate, 0.0))
         still = own.still(still, estimate.servo)
         slip = -hand * jnp.arctan2(estimate.vy, speed)
-        missing = left_over - still + own.beyond(slip, still, estimate.servo)
+        missing = left_over - still + own.beyond(entry, slip, still, estimate.servo)
         late = now - memory.since > self.longest
         stops = (memory.phase == SPIN) & ((missing <= 0) | late)
         settles = (memory.phase == STOP) & ((rate < own.settled) | late)
@@ -162,7 +162,7 @@ class DriftTurn:
         )
         battery = jnp.clip(estimate.battery, 0.5, 1.2)
         spin = own.spin(entry, rate, estimate.friction, battery, estimate.servo)
-        stop = own.stop(entry, missing)
+        stop = own.stop(entry, missing, battery)
         on = self.straight.command(straight, seen, self.straight.speed)
         steering, throttle = on.steering, on.throttle
         for which, lock, power in (

@@ -11,8 +11,9 @@
     [source]
     stop_angle = "where these numbers are from"
 
-A list holds a number for each speed. Numbers with a default in `Turning` may be left out. An
-absent table is replaced by that of the library's `drift-turn.toml`, which has all tables.
+A list holds a number for each speed; where one has a default, a single number is for all.
+Numbers with a default in `Turning` may be left out. An absent table is replaced by that of the
+library's `drift-turn.toml`, which has all tables.
 """
 
 import dataclasses
@@ -87,13 +88,14 @@ TABLES: dict[str, tuple[type, dict[str, Entry]]] = {
             "hold_d": Entry("hold_d", False, "s", -10, 10),
             "hold_slip": Entry("hold_slip", False, "1", -10, 10),
             "hold_throttle": Entry("hold_throttle", False, "1", -1, 1),
-            "slip_aim": Entry("slip_aim", False, "rad", 0, 90),
+            "slip_aim": Entry("slip_aim", True, "rad", 0, 90),
             "slip_gain": Entry("slip_gain", False, "1", -10, 10),
             "lead_grip": Entry("lead_grip", False, "1", -10, 10),
             "rate_grip": Entry("rate_grip", False, "1", -10, 10),
             "rate_servo": Entry("rate_servo", False, "1", -10, 10),
             "stop_servo": Entry("stop_servo", False, "1", -10, 10),
             "aim_servo": Entry("aim_servo", False, "1", -10, 10),
+            "power": Entry("power", True, "1", -1, 1),
         },
     ),
 }
@@ -162,6 +164,11 @@ def _read(where: str, part: str, table: Any) -> Any:
         if not entry.by_speed:
             found[field] = read_value(where, key, entry.declared, value)
             continue
+        if field in optional and not isinstance(value, list):
+            found[field] = np.full(
+                len(found["speeds"]), read_value(where, key, entry.declared, value)
+            )
+            continue
         if not isinstance(value, list) or not 1 <= len(value) <= MOST_SPEEDS:
             raise InputError(f"{where}: {key} must be a list of 1 to {MOST_SPEEDS} numbers")
         found[field] = np.array(
@@ -183,7 +190,12 @@ def policy_tables(
     for part, value in (("stop_angle", stop_angle), ("turning", turning)):
         if value is not None:
             tables[part] = {
-                entry.name: _written(entry.declared, getattr(value, field))
+                entry.name: _written(
+                    entry.declared,
+                    np.broadcast_to(getattr(value, field), np.shape(value.speeds))
+                    if entry.by_speed
+                    else getattr(value, field),
+                )
                 for field, entry in TABLES[part][1].items()
             }
     return tables

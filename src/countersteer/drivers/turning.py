@@ -35,13 +35,14 @@ class Turning:
     hold_d: Scalar  # lock per yaw rate, s
     hold_slip: Scalar  # part of the front axle's sideslip that the front wheels follow
     hold_throttle: Scalar  # throttle while it settles
-    slip_aim: Scalar = 0.6  # target sideslip of a turn, rad
+    slip_aim: Array = 0.6  # target sideslip of a turn, rad
     slip_gain: Scalar = 0.0  # angle turned beyond the target per missing sideslip, rad/rad
     lead_grip: Scalar = 0.0  # relative increase of `lead` per missing part of friction
     rate_grip: Scalar = 0.0  # relative decrease of `rate` per missing part of friction
     rate_servo: Scalar = 0.0  # the same per missing part of the servo's gain
     stop_servo: Scalar = 0.0  # relative increase of the stop angle per that part
     aim_servo: Scalar = 0.0  # relative decrease of `slip_aim` per that part
+    power: Array = 0.0  # throttle of the stop
 
     def begins_at(self, speed: Scalar, grip: Scalar) -> Scalar:
         """Distance to a corner of 90° at which the turn begins (m).
@@ -73,16 +74,21 @@ class Turning:
         """The stop angle with this servo (rad). `angle` is that with the nominal servo."""
         return angle * (1 + self.stop_servo * weak(servo))
 
-    def beyond(self, slip: Scalar, still: Scalar, servo: Scalar = 1.0) -> Scalar:
+    def beyond(self, entry: Scalar, slip: Scalar, still: Scalar, servo: Scalar = 1.0) -> Scalar:
         """How far to turn beyond the target, to reach the target sideslip (rad).
 
         During the stop the car hardly changes its direction of motion. So the sideslip (`slip`,
         positive in a drift) grows by about the angle that the car still turns (`still`).
         """
-        aim = self.slip_aim * (1 - self.aim_servo * weak(servo))
+        aim = self._at(self.slip_aim, entry) * (1 - self.aim_servo * weak(servo))
         return self.slip_gain * jnp.clip(aim - (slip + still), -MOST, MOST)
 
-    def stop(self, entry: Scalar, missing: Scalar) -> Command:
-        """The command of the stop in a left turn: wheels back, no throttle. `missing` is in rad."""
+    def stop(self, entry: Scalar, missing: Scalar, battery: Scalar = 1.0) -> Command:
+        """The command of the stop in a left turn: wheels back, `power`. `missing` is in rad."""
         counter = interpolate(self.speeds, self.counter, entry)
-        return Command(0.0 * counter, self.stop_gain * missing - counter)
+        power = self._at(self.power, entry)
+        return Command(power / battery, self.stop_gain * missing - counter)
+
+    def _at(self, table: Array, speed: Scalar) -> Scalar:
+        """The value at a speed; a single number holds at all speeds."""
+        return interpolate(self.speeds, jnp.broadcast_to(table, jnp.shape(self.speeds)), speed)

@@ -14,6 +14,7 @@ NAMES = {
     "control-rate": "10 Hz by radio or 1000 Hz on board, open or closed loop, two batteries",
     "battery": "the same commands at four charges and three wears",
     "linked-turns": "four turns in a row without straightening: how far the heading drifts",
+    "action-spread": "a corner open loop by a novice's keys, the planner's commands and the best",
     "narrowest-corner": "the narrowest corner passed, and how fast, by grip and by drift",
 }
 

@@ -2,26 +2,33 @@
 
 A generation of candidates is drawn around a mean, each number independently. All candidates drive
 the same trials, in one batch. The best quarter, weighted by rank, moves the mean and the spread.
+Half of the trials are new. The others are those that went worst before: failures are rare, and a
+search that meets each only once does not learn from it.
 
 Source of the method: R. Y. Rubinstein, Methodology and Computing in Applied Probability 1, 1999.
 The weights are those of CMA-ES (N. Hansen, 2016).
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from countersteer.batch.engine import LANES
+from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.batch.population import Population, draw
 from countersteer.batch.trials import run_trials
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.policy import TABLES, Policy
+from countersteer.experiments.narrowest_corner import DRAWS, attempt
 from countersteer.pilot import Pilot
-from countersteer.task.judge import Outcome, Score
+from countersteer.task.judge import DRIFT, Outcome, Score
+from countersteer.task.turns import sideslip
 
 SPEEDS = (1.5, 2.0, 2.5, 3.0)  # m/s asked of the driver, one trial after another
 SLOWEST = 1.1  # m/s, mean speed; a slower trial is out of time
@@ -48,31 +55,78 @@ SPREAD = {
     "rate_servo": 0.3,
     "stop_servo": 0.8,
     "aim_servo": 0.5,
+    "power": 0.25,
 }
 KEEPS, STAYS = 0.35, 0.75  # weights of the old mean and the old spread in the new ones
-WANTED, LEAST, MOST = 37.0, 28.0, 48.0  # degrees of peak sideslip: aim, least and largest
+WANTED, LEAST, MOST = 37.0, 30.0, 50.0  # degrees of peak sideslip: aim, least and largest
+FREE = 11.0  # degrees of heading beyond the corridor that cost nothing
+FAILED = 10.0  # cost of a failure
+BRISK = 2.2  # m/s, mean speed of a trial whose time costs nothing
+AGAIN = 0.5  # part of a generation's trials that went badly before
+ABLE = 0.8  # least success rate and share of drifts of a car that can drift the corners
+FAST = 3.0  # m/s
+WIDER = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0)  # m, corridors that are tried in turn
+REMEMBERED = 96  # such trials for each course
 
 
 class Generation(NamedTuple):
-    """The result of a generation: of its mean, and of its best candidate."""
+    """The result of a generation: of its mean in new trials, and of its best candidate in all."""
 
     cost: float
     success_rate: float
     best_cost: float
 
 
-def cost(score: Score) -> np.ndarray:
-    """The cost of each trial: failure, too little or too much sideslip, squared heading errors."""
+class Verdict(NamedTuple):
+    """What a policy does in trials that no search has seen. Medians are of the successes."""
+
+    trials: int
+    success_rate: float
+    drift_share: float  # of the successes, those with a drift in every turn
+    peak_sideslip: float  # median, rad
+    overshoot: float  # median, rad
+    lap_time: float  # median, s
+    because: str | None  # why the car cannot drift the corners; None: it can
+
+
+class Trials(NamedTuple):
+    """Trials of a course: a seed, and the speed that is asked of the driver (m/s), for each."""
+
+    seeds: tuple[int, ...]
+    speeds: tuple[float, ...]
+
+    @classmethod
+    def of(cls, seeds: Sequence[int]) -> "Trials":
+        """Trials at all speeds of `SPEEDS` in turn."""
+        return cls(tuple(seeds), tuple(SPEEDS[i % len(SPEEDS)] for i in range(len(seeds))))
+
+    def __add__(self, others: "Trials") -> "Trials":  # type: ignore[override]
+        return Trials(self.seeds + others.seeds, self.speeds + others.speeds)
+
+    def picked(self, rows: np.ndarray) -> "Trials":
+        """Some of them."""
+        return Trials(*(tuple(column[i] for i in rows) for column in self))
+
+
+def cost(score: Score, shortest: float) -> np.ndarray:
+    """The cost of each trial: of failure, sideslip, heading, and time. A car's least is 0.
+
+    Sideslip costs below `WANTED`, more below `LEAST`, and above `MOST`. The heading costs by its
+    squared error at a turn's end, and where it went further than `FREE` beyond the corridor's. Time
+    costs over `shortest` (s).
+    """
     turns, won = score.turns, score.outcome == Outcome.REACHED.code
     ended = np.isfinite(turns.end)
     done = ended.sum(axis=1)
     slip, error = np.degrees(turns.peak_sideslip), np.abs(np.degrees(turns.error))
-    missing = np.clip(WANTED - slip, 0, 20) / 10 + 1.2 * np.clip((LEAST - slip) / 4, 0, 1)
+    missing = np.clip(WANTED - slip, 0, 20) / 10 + 3 * np.clip((LEAST - slip) / 4, 0, 1)
     much = np.clip(slip - MOST, 0, 40) / 20
-    each = missing + much + 0.35 * np.minimum(error / 3, 6.0) ** 2
+    beyond = np.clip(np.degrees(turns.overshoot) - FREE, 0, 60) / 12
+    each = missing + much + beyond + 0.35 * np.minimum(error / 3, 6.0) ** 2
     turned = np.where(ended, each, 0.0).sum(axis=1) / np.maximum(done, 1)
-    failed = np.where(won, 0.0, 6.0 + 2.0 * (1 - done / ended.shape[1]))
-    total: np.ndarray = failed + turned
+    failed = np.where(won, 0.0, FAILED + 2.0 * (1 - done / ended.shape[1]))
+    late = np.where(won, np.maximum(score.goal_time / shortest - 1, 0.0), 0.0)
+    total: np.ndarray = failed + turned + 2.4 * late
     return total
 
 
@@ -82,8 +136,8 @@ def search(
     population: Population,
     begin: Policy,
     generations: int,
-    candidates: int = 32,
-    trials: int = 48,
+    candidates: int = 24,
+    trials: int = 56,
     spread: float = 0.5,
     seed: int = 0,
     report: Callable[[int, Generation], None] = lambda *_: None,
@@ -101,17 +155,26 @@ def search(
     best = max(candidates // 4, 1)
     weights = np.log(best + 0.5) - np.log(np.arange(1, best + 1))
     weights /= weights.sum()
+    hard = [Trials((), ()) for _ in courses]
     for number in range(generations):
+        course, old = courses[number % len(courses)], hard[number % len(courses)]
         tried = mean + deviation * rng.standard_normal((candidates, len(mean)))
         tried[0] = mean
         tried = np.clip(tried, *limits)
-        seeds = range(1000 + seed + number * trials, 1000 + seed + (number + 1) * trials)
-        policies = [shaped(begin, numbers) for numbers in tried]
-        score = drive(courses[number % len(courses)], car, population, policies, seeds)
-        costs = cost(score).reshape(candidates, trials).mean(axis=1)
-        won = np.mean(score.outcome[:trials] == Outcome.REACHED.code)
+        again = min(len(old.seeds), round(AGAIN * trials))
+        first = 1000 + seed + number * trials
+        own = Trials.of(range(first, first + trials - again))
+        own += old.picked(rng.permutation(len(old.seeds))[:again])
+        score = drive(course, car, population, [shaped(begin, row) for row in tried], own)
+        each = cost(score, (course.lap_end(1) or 0.0) / BRISK).reshape(candidates, trials)
+        costs = each.mean(axis=1)
+        new = slice(0, trials - again)
+        won = np.mean(score.outcome[new] == Outcome.REACHED.code)
         elite = tried[np.argsort(costs)[:best]]
-        report(number, Generation(float(costs[0]), float(won), float(costs.min())))
+        report(number, Generation(float(each[0, new].mean()), float(won), float(costs.min())))
+        worst = np.argsort(-each[0, new])[: max(1, trials // 8)]
+        kept = own.picked(worst) + old
+        hard[number % len(courses)] = kept.picked(np.arange(min(REMEMBERED, len(kept.seeds))))
         about = np.sqrt(weights @ (elite - mean) ** 2)
         mean = KEEPS * mean + (1 - KEEPS) * (weights @ elite)
         deviation = STAYS * deviation + (1 - STAYS) * about
@@ -119,26 +182,116 @@ def search(
 
 
 def drive(
-    course: Course,
-    car: Car,
-    population: Population,
-    policies: Sequence[Policy],
-    seeds: Sequence[int],
+    course: Course, car: Car, population: Population, policies: Sequence[Policy], trials: Trials
 ) -> Score:
     """The scores of all policies in the same trials: those of the first policy, then the next."""
-    drawn = draw(population, car, course, seeds, np.float32)
+    count = len(trials.seeds)
+    drawn = draw(population, car, course, trials.seeds, np.float32)
     plain = {speed: drift_turn(course, car, speed) for speed in SPEEDS}
     drivers = [
-        dataclasses.replace(plain[SPEEDS[i % len(SPEEDS)]], **policy._asdict())
+        dataclasses.replace(plain[speed], **policy._asdict())
         for policy in policies
-        for i in range(len(seeds))
+        for speed in trials.speeds
     ]
-    rows = np.tile(np.arange(len(seeds)), len(policies))
+    rows = np.tile(np.arange(count), len(policies))
     many: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], drawn)
     pilot = Pilot.of(drivers[0], course, car)
     longest = (course.lap_end(1) or 0.0) / SLOWEST
-    drawn_seeds = [seeds[i] for i in rows]
-    return run_trials(course, pilot, many, drivers, drawn_seeds, 1, longest)[0]
+    seeds = [trials.seeds[i] for i in rows]
+    return run_trials(course, pilot, many, drivers, seeds, 1, longest)[0]
+
+
+def verdict(
+    courses: Sequence[Course],
+    car: Car,
+    population: Population,
+    policy: Policy,
+    first: int,
+    count: int = 128,
+) -> Verdict:
+    """The policy's result on each course in `count` new trials, whose seeds begin with `first`."""
+    own = Trials.of(range(first, first + count))
+    scores = [drive(course, car, population, [policy], own) for course in courses]
+    won = [score.outcome == Outcome.REACHED.code for score in scores]
+    drifts, slips, overs, laps = [], [], [], []
+    for score, good in zip(scores, won, strict=True):
+        slip = score.turns.peak_sideslip[good]
+        drifts.append(np.all(slip > DRIFT, axis=1))
+        slips.append(slip.ravel())
+        overs.append(score.turns.overshoot[good].ravel())
+        laps.append(score.goal_time[good])
+    success = float(np.mean(np.concatenate(won)))
+    share = _mean(np.concatenate(drifts))
+    slip, over, lap = (_median(np.concatenate(part)) for part in (slips, overs, laps))
+    because = None
+    if success < ABLE or share < ABLE:
+        worst = int(np.argmin([np.mean(good) for good in won]))
+        because = reason(courses[worst], car, scores[worst])
+    return Verdict(count * len(courses), success, share, slip, over, lap, because)
+
+
+def reason(course: Course, car: Car, score: Score) -> str:
+    """Why a car cannot drift a course's corners, from trials of what was learned for it."""
+    most, at = slides(car)
+    if most < DRIFT:
+        return (
+            f"it does not slide: with the wheels hard over at up to {at:.1f} m/s its sideslip "
+            f"stays under {math.degrees(most):.0f}°, and a drift has over "
+            f"{math.degrees(DRIFT):.0f}°. Slippery rear tyres help"
+        )
+    if course.width and course.turns and not passes(car, course.width):
+        wide = [w for w in WIDER if w > course.width and passes(car, w)]
+        needs = f"at least {wide[0]:g} m" if wide else f"over {WIDER[-1]:g} m"
+        return (
+            f"the corridor is too narrow: with full knowledge it drifts round 90° in {needs}, and "
+            f"{course.name} is {course.width:g} m wide"
+        )
+    bad = score.outcome[score.outcome != Outcome.REACHED.code]
+    if len(bad) > len(score.outcome) * (1 - ABLE):
+        most_often = Outcome.of(np.bincount(bad).argmax()).value
+        return (
+            f"of {len(score.outcome)} random cars {len(bad)} fail, most with '{most_often}'. With "
+            "full knowledge it gets round: a longer search (--generations), or a wider one "
+            "(--spread 1), may find how"
+        )
+    slip = math.degrees(_median(score.turns.peak_sideslip.ravel()))
+    return (
+        f"it gets round with {slip:.0f}° of sideslip, and a drift has over "
+        f"{math.degrees(DRIFT):.0f}°; on an open floor it reaches {math.degrees(most):.0f}°: "
+        "a longer search (--generations), or a wider one (--spread 1), may find how"
+    )
+
+
+def slides(car: Car) -> tuple[float, float]:
+    """The largest sideslip (rad) of the nominal car on an open floor, and the top speed tried.
+
+    Wheels hard over from speeds up to `FAST`, with all throttles from brake to full.
+    """
+    speeds, throttles = np.meshgrid(np.linspace(0.8, FAST, 8), np.linspace(-1.0, 1.0, 9))
+    lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
+    drivers = [commands((0.0, float(throttle), lock)) for throttle in throttles.ravel()]
+    still, count = np.zeros(speeds.size), speeds.size
+    found = drives(
+        repeated(car, count),
+        np.ones(count, np.float32),
+        drivers,
+        np.stack([speeds.ravel(), still, still], axis=1),
+        1.5,
+    )
+    return float(np.max(np.abs(sideslip(found.motion.vx, found.motion.vy)))), FAST
+
+
+def passes(car: Car, width: float) -> bool:
+    """Whether the nominal car drifts round 90° in a corridor (m), with full knowledge."""
+    return bool(np.any(np.isfinite(attempt(car, width, True, DRAWS, LANES).time)))
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else math.nan
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values)) if len(values) else 0.0
 
 
 def _numbers(policy: Policy) -> list[tuple[str, Any]]:

@@ -48,12 +48,13 @@ class Costs(NamedTuple):
     clearance: float = 20.0  # of the square of how far a corner comes within `margin`, over it
     hit: float = 30.0  # of the time with a corner beyond a wall
     sideslip: float = 1.0  # of the square of how far the sideslip is from what it should be
-    straight: float = 0.3  # the part of that on straights, where it should be 0
-    overshoot: float = 4.0  # of the square of the heading beyond the corner's way out, rad²
+    excess: float = 4.0  # factor of that on more sideslip than there should be
+    straight: float = 1.0  # the part of that on straights, where it should be 0
+    overshoot: float = 6.0  # of the square of the heading beyond the corner's way out, rad²
     smoothness: float = 0.05  # of the square of the change of a command, in full commands, a knot
     backwards: float = 3.0  # of going, and of facing, against the line
     margin: float = 0.08  # m
-    drift: float = math.radians(36)  # what the sideslip should be in corners
+    drift: float = math.radians(30)  # what the sideslip should be in corners
 
 
 class Search(NamedTuple):
@@ -88,23 +89,27 @@ class Memory(NamedTuple):
 
 MOST_SLIP = 9.0  # of that square
 HISTORY = 16  # knots; a longer pure delay is cut off
+# Throttle, and steering as a part of the lock.
+HELD = tuple((throttle, side) for throttle in (-1.0, -0.5, 0.5) for side in (-1.0, 0.0, 1.0))
 SEEN = ("x", "y", "heading", "vx", "vy", "yaw_rate")
 
 
-def per_tick(problem: Problem, given: Command, commands: Command) -> Command:
+def per_tick(problem: Problem, given: Command, commands: Command, step: float) -> Command:
     """Commands (knots,) as they reach motor and servo, a value for each step of the plant."""
-    each = round(KNOT / STEP)
+    each = round(KNOT / step)
     asked = jax.tree.map(lambda a, b: jnp.repeat(jnp.concatenate([a, b]), each), given, commands)
-    arrives = plant.as_it_arrives(problem.car, asked, STEP)
-    return jax.tree.map(lambda line: line[HISTORY * each :], arrives)
+    arrives = plant.as_it_arrives(problem.car, asked, step)
+    return jax.tree.map(lambda line: line[len(given.throttle) * each :], arrives)
 
 
-def drive(problem: Problem, motion: Motion, given: Command, commands: Command) -> Motion:
-    """The motion after each knot of a plan: leaves (knots,)."""
-    state = plant.state_of(problem.car, motion, STEP)
-    ticks = per_tick(problem, given, commands)
-    every = round(KNOT / STEP)
-    _, seen = plant.rollout(problem.car, state, ticks, every, STEP, lambda s: s.motion)
+def drive(
+    problem: Problem, motion: Motion, given: Command, commands: Command, step: float = STEP
+) -> Motion:
+    """The motion after each knot of a plan: leaves (knots,). The plant's `step` is in s."""
+    state = plant.state_of(problem.car, motion, step)
+    ticks = per_tick(problem, given, commands, step)
+    every = round(KNOT / step)
+    _, seen = plant.rollout(problem.car, state, ticks, every, step, lambda s: s.motion)
     return seen
 
 
@@ -134,7 +139,9 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
     # Nose in, by `drift`, in a corner; straight elsewhere.
     off = (jnp.arctan2(motion.vy, motion.vx) + bend * costs.drift) / costs.drift
     weight = jnp.where(bend == 0, costs.straight, 1.0) * jnp.minimum(speed, 1.0)
-    slips = weight * jnp.minimum(off**2, MOST_SLIP)
+    # Too much is a spin to come: it counts more than too little.
+    much = jnp.where(bend * off < 0, costs.excess, 1.0)
+    slips = weight * jnp.minimum(much * off**2, MOST_SLIP)
     out_x, out_y = ground.out_x[row], ground.out_y[row]
     beyond = jnp.arctan2(out_x * sine - out_y * cosine, out_x * cosine + out_y * sine)
     over = jnp.maximum(bend * beyond, 0.0) ** 2
@@ -158,7 +165,11 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
 
 
 def draw(problem: Problem, key: Array, plan: Command, samples: int) -> Command:
-    """Sequences of commands (samples, KNOTS) around a plan. The first is the plan itself."""
+    """Sequences of commands (samples, KNOTS) around a plan.
+
+    The first is the plan itself. The last ones hold a command throughout (`HELD`): noise that lasts
+    for a tenth of a second never backs a car out of a spin.
+    """
     search = problem.search
     normal = jax.random.normal(key, (2, samples, KNOTS + 1), jnp.float32)
     normal = normal.at[:, 0].set(0.0)
@@ -171,7 +182,49 @@ def draw(problem: Problem, key: Array, plan: Command, samples: int) -> Command:
     _, noise = jax.lax.scan(follow, normal[:, :, 0], normal[:, :, 1:].transpose(2, 0, 1))
     throttle = plan.throttle + search.throttle * noise[:, 0].T
     steering = plan.steering + search.steering * problem.lock * noise[:, 1].T
+    held = jnp.asarray(HELD, throttle.dtype)
+    throttle = throttle.at[-len(HELD) :].set(held[:, :1])
+    steering = steering.at[-len(HELD) :].set(problem.lock * held[:, 1:])
     return Command(jnp.clip(throttle, -1.0, 1.0), jnp.clip(steering, -problem.lock, problem.lock))
+
+
+def put(mesh: Mesh, tree: Any, dtype: Any = np.float32) -> Any:
+    """The tree on all cores, in one precision: inputs of one kind share one program."""
+    here = NamedSharding(mesh, PartitionSpec())
+
+    def on(leaf: Any) -> Any:
+        array = np.asarray(leaf)
+        return jax.device_put(array.astype(dtype) if array.dtype.kind == "f" else array, here)
+
+    with jax.enable_x64(dtype == np.float64):
+        return jax.tree.map(on, tree)
+
+
+def costs_of(
+    mesh: Mesh,
+    problem: Problem,
+    place: Scalar,
+    motion: Motion,
+    given: Command,
+    drawn: Command,
+    step: float = STEP,
+) -> Array:
+    """J of each sequence of commands (samples, knots), a share on each core; inf without an end."""
+    cut, same = PartitionSpec("core"), PartitionSpec()
+
+    def on_core(
+        drawn: Command, problem: Problem, motion: Motion, given: Command, place: Scalar
+    ) -> Array:
+        def one(commands: Command) -> Scalar:
+            driven = drive(problem, motion, given, commands, step)
+            return cost(problem, place, driven, commands)
+
+        return jax.vmap(one)(drawn)
+
+    found = jax.shard_map(
+        on_core, mesh=mesh, in_specs=(cut, same, same, same, same), out_specs=cut, check_vma=False
+    )(drawn, problem, motion, given, place)
+    return jnp.where(jnp.isfinite(found), found, jnp.inf)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -182,21 +235,7 @@ def decide(
     key, fresh = jax.random.split(jax.random.wrap_key_data(memory.key))
     place = problem.ground.follow(motion.x, motion.y, memory.place)
     drawn = draw(problem, fresh, memory.commands, samples)
-    cut, same = PartitionSpec("core"), PartitionSpec()
-
-    def on_core(
-        drawn: Command, problem: Problem, motion: Motion, given: Command, place: Scalar
-    ) -> Scalar:
-        def one(commands: Command) -> Scalar:
-            driven = drive(problem, motion, given, commands)
-            return cost(problem, place, driven, commands)
-
-        return jax.vmap(one)(drawn)
-
-    found = jax.shard_map(
-        on_core, mesh=mesh, in_specs=(cut, same, same, same, same), out_specs=cut, check_vma=False
-    )(drawn, problem, motion, memory.given, place)
-    found = jnp.where(jnp.isfinite(found), found, jnp.inf)
+    found = costs_of(mesh, problem, place, motion, memory.given, drawn)
     weights = jnp.exp((jnp.min(found) - found) / problem.search.temperature)
     weights = weights / jnp.sum(weights)
     plan = jax.tree.map(lambda lines: weights @ lines, drawn)
@@ -207,6 +246,23 @@ def decide(
     moved = jax.tree.map(lambda line: jnp.append(line[1:], line[-1]), plan)
     given = jax.tree.map(lambda line, new: jnp.append(line[1:], new), memory.given, command)
     return command, Memory(jax.random.key_data(key), after, place, moved, given)
+
+
+def problem_of(
+    course: Course, car: Car, laps: int, costs: Costs, search: Search
+) -> tuple[Problem, float]:
+    """The problem of a course and a nominal car, and the place of the start (m)."""
+    ground = ground_of(course)
+    lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
+    place, end = start_of(course, ground), course.lap_end(laps)
+    goal = math.inf if end is None else place + end - course.start_distance
+    return Problem(car, ground, costs, search, lock, goal), place
+
+
+def at_rest(pose: tuple[Scalar, Scalar, Scalar]) -> Motion:
+    """The motion of a car that stands, with a full battery."""
+    parts: list[Any] = [*pose, *[0.0] * 3, Wheels(*[0.0] * 4), *[0.0] * 4, 1.0]
+    return Motion(*parts)
 
 
 class Mppi:
@@ -225,33 +281,19 @@ class Mppi:
         samples: int = SAMPLES,
     ) -> None:
         """For a course with a centre line and the nominal car. Raises `InputError`."""
-        ground = ground_of(course)
-        lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
         self._mesh = Mesh(np.array(jax.devices()), ("core",))
         self._samples = math.ceil(samples / self._mesh.size) * self._mesh.size
-        self._start, self._place = course.start, start_of(course, ground)
+        problem, self._place = problem_of(course, car, laps, costs, search)
+        self._start = course.start
         self._radii = [float(t.radius) for t in (car.tires.front, car.tires.rear)]
-        end = course.lap_end(laps)
-        goal = math.inf if end is None else self._place + end - course.start_distance
-        self._problem = self._put(Problem(car, ground, costs, search, lock, goal))
+        self._problem = self._put(problem)
 
     def _put(self, tree: Any) -> Any:
-        """The tree on all cores, in 32 bits: inputs of one kind share one program."""
-        here = NamedSharding(self._mesh, PartitionSpec())
-
-        def put(leaf: Any) -> Any:
-            array = np.asarray(leaf)
-            return jax.device_put(
-                array.astype(np.float32) if array.dtype.kind == "f" else array, here
-            )
-
-        with jax.enable_x64(False):
-            return jax.tree.map(put, tree)
+        return put(self._mesh, tree)
 
     def reset(self, key: Array) -> Memory:
         """At rest at the start, with no throttle planned."""
-        parts: list[Any] = [*self._start, *[0.0] * 3, Wheels(*[0.0] * 4), *[0.0] * 4, 1.0]
-        motion = Motion(*parts)
+        motion = at_rest(self._start)
         none = Command(np.zeros(KNOTS), np.zeros(KNOTS))
         given = Command(np.zeros(HISTORY), np.zeros(HISTORY))
         memory: Memory = self._put(
