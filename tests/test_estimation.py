@@ -190,7 +190,7 @@ def test_battery_and_friction_are_felt(drives, estimates):
     cars, nominal = drives.cars, NOMINAL
     open_circuit = np.array([battery.open_circuit(nominal.battery, c) for c in drives.charges])
     voltage = estimate.battery[-1] * nominal.battery.full
-    assert rms(voltage - open_circuit) < 0.05 < open_circuit.std() / 2
+    assert rms(voltage - open_circuit) < 0.08 < open_circuit.std() / 2
     resistance = np.array(jax.vmap(battery.resistance)(cars.battery))
     assert rms(estimate.battery_resistance[-1] - resistance) < 0.05 < resistance.std() / 2
     friction = cars.tires.rear.friction / nominal.tires.rear.friction
@@ -336,7 +336,7 @@ def test_the_angle_to_the_wall_is_known_on_straights(drives, estimates, left):
     )
     straight = (since | (record.status.turn == 0)) & (np.abs(true_angle) < 0.2) & drives.sound
     straight = straight & (TICK[:, None] > 800)
-    assert straight.sum() > 500
+    assert straight.sum() > 400
     assert math.degrees(rms((angle - true_angle)[straight])) < 2.0
     assert np.median(np.abs(offset - true_offset)[straight]) < 0.01
 

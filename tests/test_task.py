@@ -342,8 +342,10 @@ def test_a_log_may_rest_have_gaps_and_empty_poses(tmp_path):
     rest = np.arange(0, 7.0, 0.01)
     late = {n: np.concatenate([np.full(len(rest), c[0]), c]) for n, c in poses.items()}
     late["time_s"] = np.concatenate([rest, 7.0 + poses["time_s"]])
-    gap = (late["time_s"] < 7.0 + 2.6) | (late["time_s"] > 7.0 + 2.9)
-    late = Table({n: c[gap] for n, c in late.items()})
+    # Between two turns: within one, the peak of its sideslip could be lost.
+    middle = 7.0 + (told["turns"][0]["end_s"] + told["turns"][1]["begin_s"]) / 2
+    kept = np.abs(late["time_s"] - middle) > 0.15
+    late = Table({n: c[kept] for n, c in late.items()})
     _, found = judge_run(dataclasses.replace(run, truth=late, telemetry=None), course)
     assert found["outcome"] == "goal reached"
     for one, other in zip(found["turns"], told["turns"], strict=True):

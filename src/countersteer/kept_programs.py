@@ -10,6 +10,7 @@ A stored program is StableHLO with its digest, and the structure of its result a
 executes nothing, and imports only classes of this package.
 """
 
+import atexit
 import contextlib
 import dataclasses
 import functools
@@ -153,15 +154,27 @@ def preload(what: str) -> None:
     for key, device, _ in wanted:
         _coming[key, device] = Future()
 
+    ends = threading.Event()
+
     def load() -> None:
         for key, device, wide in wanted:
             try:
+                if ends.is_set():
+                    raise InterruptedError
                 with jax.enable_x64(wide), jax.default_device(device):
                     _coming[key, device].set_result(_read(key, device))
             except BaseException:  # it is loaded or made again where it is needed
                 _coming[key, device].set_result(None)
 
-    threading.Thread(target=load, daemon=True).start()
+    def end() -> None:
+        ends.set()
+        thread.join()
+
+    # Python stops a thread that runs when it ends, and XLA aborts the process where one of its own
+    # functions is stopped. So the end waits for the program that is being loaded.
+    atexit.register(end)
+    thread = threading.Thread(target=load, daemon=True)
+    thread.start()
 
 
 def remember(what: str) -> None:

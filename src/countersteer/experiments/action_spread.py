@@ -19,7 +19,7 @@ from countersteer.course.course import Course, from_segments
 from countersteer.drivers.replay import Replay
 from countersteer.experiments.best_drive import Flying, best, planned
 from countersteer.experiments.result import Report, Result, silent
-from countersteer.planning.mppi import KNOT
+from countersteer.planning.mppi import KNOT, Costs
 from countersteer.signals import Command
 from countersteer.task.judge import DRIFT
 
@@ -28,7 +28,9 @@ SEED = 40_000  # of the first car
 BEFORE, SPEED = 1.6, 2.2  # m before the corner, and m/s, at which all begin
 SECONDS = 1.6  # of commands; then they are held, and the heading is read
 ROUNDS = 300  # of the search for the optimum
-GATE = 1.0  # m behind the corner; who passes it without a touch is through
+WIDTH = 1.4  # m, of the corridor
+COSTS = Costs(margin=0.25)  # commands that nobody corrects need room
+GATE = 1.2  # m behind the corner; who passes it without a touch is through
 LINED_UP = math.radians(30)
 LATE, SCATTER = 0.12, 0.05  # s, mean and standard deviation of a novice's delay
 KEY = 1 / 3  # part of the full command from which a key is pressed
@@ -50,7 +52,7 @@ class Spread(NamedTuple):
 def corner() -> Course:
     """A corner to the left, 3 m from the start."""
     turn = [("straight", 3.0, 0.0), ("turn", math.pi / 2, 0.0), ("straight", 4.0, 0.0)]
-    return from_segments("corner", 1.0, False, turn)
+    return from_segments("corner", WIDTH, False, turn)
 
 
 def as_keys(commands: Command, lock: float) -> Command:
@@ -87,7 +89,7 @@ def spread(course: Course, car: Car, commands: list[Command], first: int = SEED)
         drawn.cars, drawn.charge, drivers, velocity, SECONDS + 1.0, pose, course.walls, drawn.floor
     )
     m = sampled.motion
-    passed = (m.y >= GATE) & (np.abs(m.x - 3.0) < 0.5)
+    passed = (m.y >= GATE) & (np.abs(m.x - 3.0) < WIDTH / 2)
     reached, at = np.any(passed, axis=1), np.argmax(passed, axis=1)
     last, rows = np.where(reached, at, passed.shape[1] - 1), np.arange(count)
     on_way = np.arange(passed.shape[1])[None] <= last[:, None]
@@ -110,9 +112,15 @@ def simulate(
     """Find the commands for the nominal car, then drive them with random cars."""
     course, flying = corner(), Flying(3.0 - BEFORE, SPEED)
     steps = rounds + 4 * 20
-    own = planned(course, car, flying=flying, seconds=SECONDS)
+    own = planned(course, car, flying=flying, seconds=SECONDS, costs=COSTS)
     found = best(
-        course, car, own, rounds, flying=flying, report=lambda done, _: report(done, steps)
+        course,
+        car,
+        own,
+        rounds,
+        flying=flying,
+        costs=COSTS,
+        report=lambda done, _: report(done, steps),
     )
     lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
     keys = as_keys(found.commands, lock)
@@ -173,8 +181,8 @@ def _paint(name: str, results: dict[str, Spread], figure: Any) -> None:
         for x, y in zip(one.tracks[0][:150], one.tracks[1][:150], strict=True):
             ax.plot(x, y, color=colour, lw=0.4, alpha=0.4)
         ax.set_aspect("equal")
-        ax.set_xlim(1.2, 3.8)
-        ax.set_ylim(-0.7, 1.6)
+        ax.set_xlim(1.0, 4.0)
+        ax.set_ylim(-0.9, 1.8)
         ax.set_title(f"{kind}: {100 * np.mean(one.through):.0f} % through")
         ax.set_xlabel("m")
     figure.suptitle(f"action-spread: {name}, 150 cars of each")
