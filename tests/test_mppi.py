@@ -117,7 +117,8 @@ def test_commands_are_drawn_around_the_plan_within_their_limits() -> None:
     assert np.abs(drawn.throttle).max() <= 1
     assert np.abs(drawn.steering).max() <= 0.45 + 1e-6
     narrow = problem()._replace(search=Search(throttle=0.1, steering=0.1))
-    free = np.asarray(mppi.draw(narrow, jax.random.key(1), plan, 4000).throttle)[1:] - 0.2
+    drawn = mppi.draw(narrow, jax.random.key(1), plan, 4000)
+    free = np.asarray(drawn.throttle)[1 : -len(mppi.HELD)] - 0.2
     assert free.std(axis=0) == pytest.approx(0.1, rel=0.1)
     lasting = np.mean(free[:, :-1] * free[:, 1:]) / np.mean(free**2)
     assert lasting == pytest.approx(Search().lasting, abs=0.02)
@@ -126,7 +127,7 @@ def test_commands_are_drawn_around_the_plan_within_their_limits() -> None:
 def test_a_command_reaches_the_motor_after_its_delay() -> None:
     made = problem()
     given = Command(jnp.full(mppi.HISTORY, 0.3), jnp.zeros(mppi.HISTORY))
-    ticks = mppi.per_tick(made, given, resting())
+    ticks = mppi.per_tick(made, given, resting(), mppi.STEP)
     late = float(CAR.motor.delay) / mppi.STEP
     assert late > 0
     np.testing.assert_allclose(ticks.throttle[: int(late)], 0.3, atol=1e-6)

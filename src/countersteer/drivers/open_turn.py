@@ -27,7 +27,7 @@ class OpenTurnMemory(NamedTuple):
 
 @pytree
 class OpenTurn:
-    """Runs up, spins by `Turning.spin`, and stops by `Turning.stop` with no missing angle.
+    """Runs up, spins by `Turning.spin`, and stops by the lock of `Turning.stop`, without throttle.
 
     The throttle is killed at the yaw rate `kill`, or `longest` seconds after the spin began.
     """
@@ -60,7 +60,7 @@ class OpenTurn:
         spin = self.turning.spin(self.speed, rate)
         stop = self.turning.stop(self.speed, 0.0)
         steering = jnp.where(phase == SPIN, spin.steering, stop.steering)
-        throttle = jnp.where(phase == SPIN, spin.throttle, stop.throttle)
+        throttle = jnp.where(phase == SPIN, spin.throttle, 0.0)
         ahead = phase == AHEAD
         held = jnp.clip(self.hold + 0.25 * (self.speed - estimate.vx), 0.0, 1.0)
         command = Command(
