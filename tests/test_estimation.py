@@ -192,7 +192,7 @@ def test_battery_and_friction_are_felt(drives, estimates):
     voltage = estimate.battery[-1] * nominal.battery.full
     assert rms(voltage - open_circuit) < 0.08 < open_circuit.std() / 2
     resistance = np.array(jax.vmap(battery.resistance)(cars.battery))
-    assert rms(estimate.battery_resistance[-1] - resistance) < 0.05 < resistance.std() / 2
+    assert rms(estimate.battery_resistance[-1] - resistance) < 0.06 < resistance.std() / 2
     friction = cars.tires.rear.friction / nominal.tires.rear.friction
     assert rms(estimate.friction[-1] - friction) < 0.75 * rms(friction - 1)
 
@@ -331,7 +331,7 @@ def test_the_angle_to_the_wall_is_known_on_straights(drives, estimates, left):
     corner = COURSE.line[record.status.turn.astype(int) % 4]
     true_offset = along[0] * (motion.y - corner[..., 1]) - along[1] * (motion.x - corner[..., 0])
     true_angle = motion.heading - bearing
-    since = (np.cumsum(record.status.turn >= 1, axis=0) * STEP * DT > 1.5) & (
+    since = (np.cumsum(record.status.turn >= 1, axis=0) * STEP * DT > 1.0) & (
         record.status.turn == 1
     )
     straight = (since | (record.status.turn == 0)) & (np.abs(true_angle) < 0.2) & drives.sound
