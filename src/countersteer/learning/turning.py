@@ -100,7 +100,8 @@ class Trials(NamedTuple):
         """Trials at all speeds of `SPEEDS` in turn."""
         return cls(tuple(seeds), tuple(SPEEDS[i % len(SPEEDS)] for i in range(len(seeds))))
 
-    def __add__(self, others: "Trials") -> "Trials":  # type: ignore[override]
+    def joined(self, others: "Trials") -> "Trials":
+        """These, and others after them."""
         return Trials(self.seeds + others.seeds, self.speeds + others.speeds)
 
     def picked(self, rows: np.ndarray) -> "Trials":
@@ -164,7 +165,7 @@ def search(
         again = min(len(old.seeds), round(AGAIN * trials))
         first = 1000 + seed + number * trials
         own = Trials.of(range(first, first + trials - again))
-        own += old.picked(rng.permutation(len(old.seeds))[:again])
+        own = own.joined(old.picked(rng.permutation(len(old.seeds))[:again]))
         score = drive(course, car, population, [shaped(begin, row) for row in tried], own)
         each = cost(score, (course.lap_end(1) or 0.0) / BRISK).reshape(candidates, trials)
         costs = each.mean(axis=1)
@@ -173,7 +174,7 @@ def search(
         elite = tried[np.argsort(costs)[:best]]
         report(number, Generation(float(each[0, new].mean()), float(won), float(costs.min())))
         worst = np.argsort(-each[0, new])[: max(1, trials // 8)]
-        kept = own.picked(worst) + old
+        kept = own.picked(worst).joined(old)
         hard[number % len(courses)] = kept.picked(np.arange(min(REMEMBERED, len(kept.seeds))))
         about = np.sqrt(weights @ (elite - mean) ** 2)
         mean = KEEPS * mean + (1 - KEEPS) * (weights @ elite)
