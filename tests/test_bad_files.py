@@ -55,7 +55,7 @@ def refusal(read, *given: object) -> str:
     with pytest.raises(InputError) as caught:
         read(*given)
     text = str(caught.value)
-    assert time.monotonic() - begin < 1
+    assert time.monotonic() - begin < 20, "a small file keeps nobody waiting"
     assert text.isprintable(), text
     assert len(text) < 600
     return text
