@@ -13,6 +13,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import changed
 from countersteer.compiling import configure_jax
 from countersteer.course.course import Course
+from countersteer.drivers.policy import load_policy
 from countersteer.drivers.replay import Replay
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
@@ -31,6 +32,8 @@ from countersteer.world.state import State
 LANES = 32  # cars in a batch: always as many, so that there is one program
 PIECE = 100  # ticks that a call of it takes
 ROWS = 8  # walls of each car
+# The numbers of drift-turn where a drive is only what filters, faults or the judge are tried on.
+STEADY = load_policy(str(Path(__file__).with_name("steady.toml")))
 SLOTS = 512  # of the delay lines: 20 ms at the finest step
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from conftest import stacked, varied
+from conftest import STEADY, stacked, varied
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.drift_turn import drift_turn
@@ -71,7 +71,7 @@ def drawn(rng):
 @pytest.fixture(scope="module")
 def drives() -> Drives:
     rng = np.random.default_rng(5)
-    driver = drift_turn(COURSE, NOMINAL)
+    driver = drift_turn(COURSE, NOMINAL, None, 1, *STEADY)
     simulators = []
     for seed in range(CARS):
         car, charge = drawn(rng)
@@ -190,9 +190,9 @@ def test_battery_and_friction_are_felt(drives, estimates):
     cars, nominal = drives.cars, NOMINAL
     open_circuit = np.array([battery.open_circuit(nominal.battery, c) for c in drives.charges])
     voltage = estimate.battery[-1] * nominal.battery.full
-    assert rms(voltage - open_circuit) < 0.08 < open_circuit.std() / 2
+    assert rms(voltage - open_circuit) < 0.05 < open_circuit.std() / 2
     resistance = np.array(jax.vmap(battery.resistance)(cars.battery))
-    assert rms(estimate.battery_resistance[-1] - resistance) < 0.06 < resistance.std() / 2
+    assert rms(estimate.battery_resistance[-1] - resistance) < 0.05 < resistance.std() / 2
     friction = cars.tires.rear.friction / nominal.tires.rear.friction
     assert rms(estimate.friction[-1] - friction) < 0.75 * rms(friction - 1)
 
@@ -331,12 +331,12 @@ def test_the_angle_to_the_wall_is_known_on_straights(drives, estimates, left):
     corner = COURSE.line[record.status.turn.astype(int) % 4]
     true_offset = along[0] * (motion.y - corner[..., 1]) - along[1] * (motion.x - corner[..., 0])
     true_angle = motion.heading - bearing
-    since = (np.cumsum(record.status.turn >= 1, axis=0) * STEP * DT > 1.0) & (
+    since = (np.cumsum(record.status.turn >= 1, axis=0) * STEP * DT > 1.5) & (
         record.status.turn == 1
     )
     straight = (since | (record.status.turn == 0)) & (np.abs(true_angle) < 0.2) & drives.sound
     straight = straight & (TICK[:, None] > 800)
-    assert straight.sum() > 400
+    assert straight.sum() > 500
     assert math.degrees(rms((angle - true_angle)[straight])) < 2.0
     assert np.median(np.abs(offset - true_offset)[straight]) < 0.01
 

@@ -1,6 +1,9 @@
 """Programs kept between processes: the same result, and nothing that is read is trusted."""
 
 import json
+import os
+import subprocess
+import sys
 from typing import NamedTuple
 
 import jax
@@ -111,6 +114,38 @@ def test_a_program_can_be_loaded_ahead(monkeypatch):
     again = Kept(never, (2,))
     assert float(again(ASKED, 3.0, 2)[1][0].steering) == -0.75
     assert again._last[2] is program
+
+
+ENDS_EARLY = """
+import json, time
+import jax
+from countersteer import kept_programs
+
+def slow(key, device):
+    time.sleep(0.5)
+    print("loaded", key, flush=True)
+
+kept_programs._read = slow
+folder = kept_programs._folder()
+folder.mkdir(parents=True)
+programs = [{"key": key, "device": 0, "wide": False} for key in ("one", "two")]
+(folder / "drive.json").write_text(json.dumps({"programs": programs}))
+kept_programs.preload("drive")
+time.sleep(0.1)
+"""
+
+
+def test_the_end_waits_for_the_program_that_is_being_loaded_and_begins_no_other(tmp_path):
+    """Else Python stops the thread within XLA, which aborts the process."""
+    done = subprocess.run(
+        [sys.executable, "-c", ENDS_EARLY],
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["loaded", "one"]
 
 
 WRONG = ["", "{}", '{"programs": [{"key": "x", "device": 99, "wide": 1}]}', "[]"]

@@ -158,13 +158,12 @@ def preload(what: str) -> None:
 
     def load() -> None:
         for key, device, wide in wanted:
-            try:
-                if ends.is_set():
-                    raise InterruptedError
-                with jax.enable_x64(wide), jax.default_device(device):
-                    _coming[key, device].set_result(_read(key, device))
-            except BaseException:  # it is loaded or made again where it is needed
-                _coming[key, device].set_result(None)
+            program = None  # then it is loaded or made again where it is needed
+            with contextlib.suppress(BaseException):
+                if not ends.is_set():
+                    with jax.enable_x64(wide), jax.default_device(device):
+                        program = _read(key, device)
+            _coming[key, device].set_result(program)
 
     def end() -> None:
         ends.set()

@@ -5,12 +5,8 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from countersteer.cli.options import DONE, Progress, Verbs, number, out_file
-
-if TYPE_CHECKING:
-    from countersteer.learning.turning import Verdict
 
 UNSEEN = 10_000_000  # first seed of the trials that judge what was learned
 
@@ -85,6 +81,7 @@ def run_turn(options: argparse.Namespace) -> int:
 
 def learn_turn(options: argparse.Namespace) -> int:
     """The search for the numbers of a turn."""
+    from countersteer.batch.evaluate import table_lines
     from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
     from countersteer.compiling import configure_jax
@@ -128,39 +125,16 @@ def learn_turn(options: argparse.Namespace) -> int:
     )
     # Seeds that the search has not used.
     found = verdict(courses, car, population, policy, (UNSEEN + options.seed) % 2**31)
-    told = _verdict_json(found)
     if options.json:
-        print(json.dumps({"policy": str(options.out), "generations": history, "verdict": told}))
+        print(json.dumps({"policy": str(options.out), "generations": history, "verdict": found}))
         return DONE
-    if found.because is not None:
-        names = " and ".join(course.name for course in courses)
-        print(f"{Path(options.car).stem} cannot drift the corners of {names}: {found.because}")
-    print(
-        f"in {found.trials} new trials {100 * found.success_rate:.0f} % get round, "
-        f"{100 * found.drift_share:.0f} % of them with a drift in every turn"
-        + (
-            f": {told['peak_sideslip_deg_median']:.0f}° of sideslip, heading "
-            f"{told['heading_overshoot_deg_median']:.0f}° too far, {found.lap_time:.2f} s"
-            if found.success_rate
-            else ""
-        )
-    )
+    print("\n".join(["in new trials:", *table_lines(found)]))
+    for course, told in found.items():
+        if told["cannot_drift_because"]:
+            whose = Path(options.car).stem
+            print(f"{whose} cannot drift the corners of {course}: {told['cannot_drift_because']}")
     print(f"policy: {options.out}")
     return DONE
-
-
-def _verdict_json(found: "Verdict") -> dict[str, Any]:
-    """The verdict by the names of the JSON."""
-    plain = {
-        "trials": found.trials,
-        "success_rate": found.success_rate,
-        "drift_share": found.drift_share,
-        "peak_sideslip_deg_median": math.degrees(found.peak_sideslip),
-        "heading_overshoot_deg_median": math.degrees(found.overshoot),
-        "lap_time_s_median": found.lap_time,
-        "cannot_drift_because": found.because,
-    }
-    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in plain.items()}
 
 
 def run_optimum(options: argparse.Namespace) -> int:
@@ -174,6 +148,7 @@ def learn_optimum(options: argparse.Namespace) -> int:
     import numpy as np
 
     from countersteer.car.files import load_car
+    from countersteer.cli.recorded import summary_lines
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.experiments.best_drive import best, judged, planned
@@ -187,7 +162,6 @@ def learn_optimum(options: argparse.Namespace) -> int:
     if not options.json:
         print("the planner drives first, some twenty seconds a lap", flush=True)
     begin = planned(course, car, laps)
-
     with Progress(options.json) as progress:
         found = best(
             course,
@@ -215,18 +189,10 @@ def learn_optimum(options: argparse.Namespace) -> int:
         print(json.dumps(result | {"commands": str(options.out)}))
         return DONE
     for who in ("planner", "optimum"):
-        print(f"  {who}: {_in_words(result[who])}")
+        first, *turns = summary_lines(result[who])
+        print("\n".join([f"{who}: {first}", *turns]))
     print(
         f"commands: {options.out}; to see them: "
         f"countersteer drive {options.course} --car {options.car} --driver {options.out}"
     )
     return DONE
-
-
-def _in_words(drive: dict[str, Any]) -> str:
-    """The judge's summary of a drive, in a line."""
-    lap, turns = drive["lap_time_s"], drive["turns"]
-    slips = ", ".join(f"{turn['peak_sideslip_deg']:.0f}°" for turn in turns)
-    over = ", ".join(f"{turn['heading_overshoot_deg']:.0f}°" for turn in turns)
-    time = drive["outcome"] if lap is None else f"{lap:.2f} s"
-    return f"{time}; sideslip {slips or 'none'}; heading too far {over or 'none'}"

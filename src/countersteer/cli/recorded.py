@@ -80,15 +80,22 @@ def prepare_the_rest(what: "Drive") -> None:
 
 def print_result(result: dict[str, Any], folder: Path) -> None:
     """The summary for a person."""
+    print("\n".join(summary_lines(result)))
+    print(f"report: {folder / 'report.html'}")
+
+
+def summary_lines(result: dict[str, Any]) -> list[str]:
+    """The judge's summary of a drive in words."""
     lap = f" in {result['lap_time_s']:.2f} s" if result["lap_time_s"] else ""
     touched = result["wall_contacts"]
-    print(f"{result['verdict']}{lap}, {touched} wall contact{'s' if touched != 1 else ''}")
-    for i, turn in enumerate(result["turns"], start=1):
-        print(
+    return [
+        f"{result['verdict']}{lap}, {touched} wall contact{'s' if touched != 1 else ''}",
+        *(
             f"  turn {i}: in at {turn['entry_speed_mps']:.2f} m/s, "
             f"sideslip {turn['peak_sideslip_deg']:.0f}°, "
             f"yaw rate {turn['peak_yaw_rate_degps']:.0f} °/s, "
             f"{turn['heading_overshoot_deg']:.0f}° too far and back, "
             f"out {turn['heading_error_deg']:+.1f}° off after {turn['duration_s']:.2f} s"
-        )
-    print(f"report: {folder / 'report.html'}")
+            for i, turn in enumerate(result["turns"], start=1)
+        ),
+    ]

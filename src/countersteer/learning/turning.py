@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from countersteer.batch.engine import LANES
+from countersteer.batch.evaluate import results
 from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.batch.population import Population, draw
 from countersteer.batch.trials import run_trials
@@ -77,36 +78,24 @@ class Generation(NamedTuple):
     best_cost: float
 
 
-class Verdict(NamedTuple):
-    """What a policy does in trials that no search has seen. Medians are of the successes."""
-
-    trials: int
-    success_rate: float
-    drift_share: float  # of the successes, those with a drift in every turn
-    peak_sideslip: float  # median, rad
-    overshoot: float  # median, rad
-    lap_time: float  # median, s
-    because: str | None  # why the car cannot drift the corners; None: it can
-
-
-class Trials(NamedTuple):
-    """Trials of a course: a seed, and the speed that is asked of the driver (m/s), for each."""
+class Drills(NamedTuple):
+    """Drills of a course: a seed, and the speed that is asked of the driver (m/s), for each."""
 
     seeds: tuple[int, ...]
     speeds: tuple[float, ...]
 
     @classmethod
-    def of(cls, seeds: Sequence[int]) -> "Trials":
+    def of(cls, seeds: Sequence[int]) -> "Drills":
         """Trials at all speeds of `SPEEDS` in turn."""
         return cls(tuple(seeds), tuple(SPEEDS[i % len(SPEEDS)] for i in range(len(seeds))))
 
-    def joined(self, others: "Trials") -> "Trials":
+    def joined(self, others: "Drills") -> "Drills":
         """These, and others after them."""
-        return Trials(self.seeds + others.seeds, self.speeds + others.speeds)
+        return Drills(self.seeds + others.seeds, self.speeds + others.speeds)
 
-    def picked(self, rows: np.ndarray) -> "Trials":
+    def picked(self, rows: np.ndarray) -> "Drills":
         """Some of them."""
-        return Trials(*(tuple(column[i] for i in rows) for column in self))
+        return Drills(*(tuple(column[i] for i in rows) for column in self))
 
 
 def cost(score: Score, shortest: float) -> np.ndarray:
@@ -156,7 +145,7 @@ def search(
     best = max(candidates // 4, 1)
     weights = np.log(best + 0.5) - np.log(np.arange(1, best + 1))
     weights /= weights.sum()
-    hard = [Trials((), ()) for _ in courses]
+    hard = [Drills((), ()) for _ in courses]
     for number in range(generations):
         course, old = courses[number % len(courses)], hard[number % len(courses)]
         tried = mean + deviation * rng.standard_normal((candidates, len(mean)))
@@ -164,7 +153,7 @@ def search(
         tried = np.clip(tried, *limits)
         again = min(len(old.seeds), round(AGAIN * trials))
         first = 1000 + seed + number * trials
-        own = Trials.of(range(first, first + trials - again))
+        own = Drills.of(range(first, first + trials - again))
         own = own.joined(old.picked(rng.permutation(len(old.seeds))[:again]))
         score = drive(course, car, population, [shaped(begin, row) for row in tried], own)
         each = cost(score, (course.lap_end(1) or 0.0) / BRISK).reshape(candidates, trials)
@@ -183,7 +172,7 @@ def search(
 
 
 def drive(
-    course: Course, car: Car, population: Population, policies: Sequence[Policy], trials: Trials
+    course: Course, car: Car, population: Population, policies: Sequence[Policy], trials: Drills
 ) -> Score:
     """The scores of all policies in the same trials: those of the first policy, then the next."""
     count = len(trials.seeds)
@@ -209,26 +198,19 @@ def verdict(
     policy: Policy,
     first: int,
     count: int = 128,
-) -> Verdict:
-    """The policy's result on each course in `count` new trials, whose seeds begin with `first`."""
-    own = Trials.of(range(first, first + count))
-    scores = [drive(course, car, population, [policy], own) for course in courses]
-    won = [score.outcome == Outcome.REACHED.code for score in scores]
-    drifts, slips, overs, laps = [], [], [], []
-    for score, good in zip(scores, won, strict=True):
-        slip = score.turns.peak_sideslip[good]
-        drifts.append(np.all(slip > DRIFT, axis=1))
-        slips.append(slip.ravel())
-        overs.append(score.turns.overshoot[good].ravel())
-        laps.append(score.goal_time[good])
-    success = float(np.mean(np.concatenate(won)))
-    share = _mean(np.concatenate(drifts))
-    slip, over, lap = (_median(np.concatenate(part)) for part in (slips, overs, laps))
-    because = None
-    if success < ABLE or share < ABLE:
-        worst = int(np.argmin([np.mean(good) for good in won]))
-        because = reason(courses[worst], car, scores[worst])
-    return Verdict(count * len(courses), success, share, slip, over, lap, because)
+) -> dict[str, dict[str, Any]]:
+    """The policy's results by course, as `evaluate`'s, in `count` trials whose seeds begin so.
+
+    `cannot_drift_because` says why a car cannot drift a course's corners; None: it can.
+    """
+    own, found = Drills.of(range(first, first + count)), {}
+    for course in courses:
+        score = drive(course, car, population, [policy], own)
+        told = results(score, own.seeds)
+        able = told["success_rate"] >= ABLE and told["drift_share"] >= ABLE
+        because = None if able else reason(course, car, score)
+        found[course.name] = told | {"cannot_drift_because": because}
+    return found
 
 
 def reason(course: Course, car: Car, score: Score) -> str:
@@ -255,7 +237,7 @@ def reason(course: Course, car: Car, score: Score) -> str:
             "full knowledge it gets round: a longer search (--generations), or a wider one "
             "(--spread 1), may find how"
         )
-    slip = math.degrees(_median(score.turns.peak_sideslip.ravel()))
+    slip = math.degrees(np.median(score.turns.peak_sideslip))
     return (
         f"it gets round with {slip:.0f}° of sideslip, and a drift has over "
         f"{math.degrees(DRIFT):.0f}°; on an open floor it reaches {math.degrees(most):.0f}°: "
@@ -285,14 +267,6 @@ def slides(car: Car) -> tuple[float, float]:
 def passes(car: Car, width: float) -> bool:
     """Whether the nominal car drifts round 90° in a corridor (m), with full knowledge."""
     return bool(np.any(np.isfinite(attempt(car, width, True, DRAWS, LANES).time)))
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else math.nan
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(np.mean(values)) if len(values) else 0.0
 
 
 def _numbers(policy: Policy) -> list[tuple[str, Any]]:
