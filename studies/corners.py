@@ -19,8 +19,15 @@ from countersteer.link.link import ONBOARD
 ANGLES = (60, 75, 90, 105, 120, 135, 150, 180)  # degrees
 ARC, RADIUS = 150, 0.7  # degrees from which a corner is an arc; m
 WIDTH, STRAIGHT = 1.4, 4.0  # m
-CARS, FIRST = 500, 3_000_000  # for each corner; first seed
+CARS, FIRST = 500, 5_000_000  # for each corner; first seed
 SPEEDS = (1.5, 3.0)  # m/s
+COLUMNS = (
+    ("success_rate", 100, 1, " %"),
+    ("drift_share", 100, 1, " %"),
+    ("heading_error_rms_deg", 1, 1, "°"),
+    ("heading_overshoot_deg_median", 1, 0, "°"),
+    ("peak_sideslip_deg_median", 1, 0, "°"),
+)
 
 
 def corner(angle: float, hand: int) -> Course:
@@ -52,15 +59,12 @@ def main() -> int:
     for angle in ANGLES:
         for hand in (1, -1):
             found = row(angle, hand)
-            print(
-                f"| {angle}° {'left' if hand > 0 else 'right'} "
-                f"| {100 * found['success_rate']:.1f} % "
-                f"| {100 * (found['drift_share'] or 0):.1f} % "
-                f"| {found['heading_error_rms_deg']:.1f}° "
-                f"| {found['heading_overshoot_deg_median']:.0f}° "
-                f"| {found['peak_sideslip_deg_median']:.0f}° |",
-                flush=True,
-            )
+            cells = [
+                "-" if found[key] is None else f"{factor * found[key]:.{digits}f}{unit}"
+                for key, factor, digits, unit in COLUMNS
+            ]
+            side = "left" if hand > 0 else "right"
+            print(f"| {angle}° {side} | {' | '.join(cells)} |", flush=True)
     return 0
 
 

@@ -90,7 +90,8 @@ def test_a_car_that_does_not_slide_is_told_so():
     grippy = load_car("rx7", ["tires.rear.friction=2.0"])
     most, _ = turning.slides(grippy)
     assert most < DRIFT < turning.slides(load_car("rx7"))[0]
-    assert "it does not slide" in turning.reason(load_course("box"), grippy, score(10.0, 0.0))
+    told = turning.reason(load_course("box"), grippy, score(10.0, 0.0))
+    assert told.startswith("cannot drift the corners of box, because it does not slide")
 
 
 def test_a_corridor_that_is_too_narrow_is_told_so():
@@ -98,8 +99,15 @@ def test_a_corridor_that_is_too_narrow_is_told_so():
         "slit", 0.3, False, [("straight", 2.0, 0.0), ("turn", 1.57, 0.0), ("straight", 2.0, 0.0)]
     )
     told = turning.reason(course, load_car("rx7"), score(10.0, 0.0))
-    assert "the corridor is too narrow" in told
-    assert "slit is 0.3 m wide" in told
+    assert told.startswith("cannot drift the corners of slit, because the corridor is too narrow")
+    assert "this one has 0.3 m" in told
+
+
+def test_a_car_that_could_drift_is_told_that_it_has_not_learned_to():
+    failed = score(40.0, 0.0, outcome=(Outcome.TOUCHED.code,), ended=(np.inf,))
+    told = turning.reason(load_course("box"), load_car("rx7"), failed)
+    assert told.startswith("has not learned to drift the corners of box: 1 of 1 random cars fail")
+    assert "'touched a wall'" in told
 
 
 def test_a_search_finds_its_way_back_from_a_spoilt_policy(tmp_path):

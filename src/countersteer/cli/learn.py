@@ -129,10 +129,9 @@ def learn_turn(options: argparse.Namespace) -> int:
         print(json.dumps({"policy": str(options.out), "generations": history, "verdict": found}))
         return DONE
     print("\n".join(["in new trials:", *table_lines(found)]))
-    for course, told in found.items():
-        if told["cannot_drift_because"]:
-            whose = Path(options.car).stem
-            print(f"{whose} cannot drift the corners of {course}: {told['cannot_drift_because']}")
+    for told in found.values():
+        if told["no_drift"]:
+            print(f"{Path(options.car).stem} {told['no_drift']}")
     print(f"policy: {options.out}")
     return DONE
 

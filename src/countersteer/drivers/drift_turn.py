@@ -125,8 +125,7 @@ class DriftTurn:
             corner = place.distance
 
         speed = jnp.maximum(estimate.vx, 0.5)
-        bend = jnp.tan(jnp.minimum(jnp.abs(angle), 2.1) / 2)
-        lead = own.begins_at(speed, estimate.friction) * bend
+        lead = own.begins_at(speed, estimate.friction, angle)
         lined_up = jnp.abs(straight.error) < 0.5
         near = (memory.phase == STRAIGHT) & (corner < lead) & lined_up
         fast = (memory.turn > 0) | (estimate.vx > 0.9 * self.straight.speed)

@@ -95,6 +95,7 @@ TABLES: dict[str, tuple[type, dict[str, Entry]]] = {
             "rate_servo": Entry("rate_servo", False, "1", -10, 10),
             "stop_servo": Entry("stop_servo", False, "1", -10, 10),
             "aim_servo": Entry("aim_servo", False, "1", -10, 10),
+            "lead_arc": Entry("lead_arc", False, "1", 0, 2),
             "power": Entry("power", True, "1", -1, 1),
         },
     ),

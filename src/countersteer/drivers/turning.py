@@ -7,6 +7,7 @@ from countersteer.drivers.stop_angle import interpolate
 from countersteer.signals import Array, Command, Scalar
 
 WEAKEST = 0.5  # largest missing part of a servo's gain that is compensated
+SHARPEST = 2.1  # rad, angle beyond which a corner's turn begins no earlier
 MOST = 0.3  # rad, largest sideslip error that is compensated
 
 
@@ -42,14 +43,19 @@ class Turning:
     rate_servo: Scalar = 0.0  # the same per missing part of the servo's gain
     stop_servo: Scalar = 0.0  # relative increase of the stop angle per that part
     aim_servo: Scalar = 0.0  # relative decrease of `slip_aim` per that part
+    lead_arc: Scalar = 1.0  # part of `lead` that grows with the corner's angle as an arc's
     power: Array = 0.0  # throttle of the stop
 
-    def begins_at(self, speed: Scalar, grip: Scalar) -> Scalar:
-        """Distance to a corner of 90° at which the turn begins (m).
+    def begins_at(self, speed: Scalar, grip: Scalar, angle: Scalar) -> Scalar:
+        """Distance to a corner at which its turn begins (m). `angle` is that of the corner (rad).
 
-        `grip` is the estimated friction of the rear axle over the nominal car's.
+        An arc of radius R begins R tan(angle / 2) before the corner. The part `lead_arc` of the
+        lead grows so; the rest, the way until the car turns, is the same for every corner. `grip`
+        is the estimated friction of the rear axle over the nominal car's.
         """
-        return interpolate(self.speeds, self.lead, speed) * (1 + self.lead_grip * (1 - grip))
+        lead = interpolate(self.speeds, self.lead, speed) * (1 + self.lead_grip * (1 - grip))
+        bend = jnp.tan(jnp.minimum(jnp.abs(angle), SHARPEST) / 2)
+        return lead * (1 + self.lead_arc * (bend - 1))
 
     def spin(
         self,

@@ -201,7 +201,7 @@ def verdict(
 ) -> dict[str, dict[str, Any]]:
     """The policy's results by course, as `evaluate`'s, in `count` trials whose seeds begin so.
 
-    `cannot_drift_because` says why a car cannot drift a course's corners; None: it can.
+    `no_drift` says why a car does not drift a course's corners; None: it does.
     """
     own, found = Drills.of(range(first, first + count)), {}
     for course in courses:
@@ -209,39 +209,40 @@ def verdict(
         told = results(score, own.seeds)
         able = told["success_rate"] >= ABLE and told["drift_share"] >= ABLE
         because = None if able else reason(course, car, score)
-        found[course.name] = told | {"cannot_drift_because": because}
+        found[course.name] = told | {"no_drift": because}
     return found
 
 
 def reason(course: Course, car: Car, score: Score) -> str:
-    """Why a car cannot drift a course's corners, from trials of what was learned for it."""
+    """Why a car does not drift a course's corners, from trials of what was learned for it.
+
+    It cannot, or it has not learned to: a sentence without its subject, which is the car.
+    """
     most, at = slides(car)
+    limit = f"a drift has over {math.degrees(DRIFT):.0f}°"
     if most < DRIFT:
         return (
-            f"it does not slide: with the wheels hard over at up to {at:.1f} m/s its sideslip "
-            f"stays under {math.degrees(most):.0f}°, and a drift has over "
-            f"{math.degrees(DRIFT):.0f}°. Slippery rear tyres help"
+            f"cannot drift the corners of {course.name}, because it does not slide: with the "
+            f"wheels hard over at up to {at:.1f} m/s its sideslip stays under "
+            f"{math.degrees(most):.0f}°, and {limit}. Slippery rear tyres help"
         )
     if course.width and course.turns and not passes(car, course.width):
         wide = [w for w in WIDER if w > course.width and passes(car, w)]
         needs = f"at least {wide[0]:g} m" if wide else f"over {WIDER[-1]:g} m"
         return (
-            f"the corridor is too narrow: with full knowledge it drifts round 90° in {needs}, and "
-            f"{course.name} is {course.width:g} m wide"
+            f"cannot drift the corners of {course.name}, because the corridor is too narrow: with "
+            f"full knowledge it drifts round 90° in {needs}, and this one has {course.width:g} m"
         )
     bad = score.outcome[score.outcome != Outcome.REACHED.code]
     if len(bad) > len(score.outcome) * (1 - ABLE):
         most_often = Outcome.of(np.bincount(bad).argmax()).value
-        return (
-            f"of {len(score.outcome)} random cars {len(bad)} fail, most with '{most_often}'. With "
-            "full knowledge it gets round: a longer search (--generations), or a wider one "
-            "(--spread 1), may find how"
-        )
-    slip = math.degrees(np.median(score.turns.peak_sideslip))
+        how = f"{len(bad)} of {len(score.outcome)} random cars fail, most with '{most_often}'"
+    else:
+        slip = math.degrees(np.median(score.turns.peak_sideslip))
+        how = f"it gets round with {slip:.0f}° of sideslip, and {limit}"
     return (
-        f"it gets round with {slip:.0f}° of sideslip, and a drift has over "
-        f"{math.degrees(DRIFT):.0f}°; on an open floor it reaches {math.degrees(most):.0f}°: "
-        "a longer search (--generations), or a wider one (--spread 1), may find how"
+        f"has not learned to drift the corners of {course.name}: {how}. With full knowledge it "
+        "can, so a longer search (--generations) or a wider one (--spread 1) may find how"
     )
 
 
