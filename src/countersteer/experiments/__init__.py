@@ -15,6 +15,7 @@ NAMES = {
     "battery": "the same commands at four charges and three wears",
     "linked-turns": "four turns in a row without straightening: how far the heading drifts",
     "action-spread": "a corner open loop by a novice's keys, the planner's commands and the best",
+    "planner-rollouts": "what the planner sees: its sequences at six instants of a lap",
     "narrowest-corner": "the narrowest corner passed, and how fast, by grip and by drift",
 }
 

@@ -52,7 +52,7 @@ class Costs(NamedTuple):
     straight: float = 1.0  # the part of that on straights, where it should be 0
     overshoot: float = 6.0  # of the square of the heading beyond the corner's way out, rad²
     smoothness: float = 0.05  # of the square of the change of a command, in full commands, a knot
-    backwards: float = 3.0  # of going, and of facing, against the line
+    backwards: float = 10.0  # of facing against the line; the sideslip does not count there
     margin: float = 0.08  # m
     drift: float = math.radians(30)  # what the sideslip should be in corners
 
@@ -87,10 +87,20 @@ class Memory(NamedTuple):
     given: Command  # (HISTORY,) the last commands, the newest last
 
 
+class Rollouts(NamedTuple):
+    """Sequences of one decision as they were driven on the plant."""
+
+    motion: Motion  # (count, KNOTS), after each knot
+    cost: Array  # (count,)
+    weight: Array  # (count,) within the decision
+    plan: Motion  # (KNOTS,) their weighted mean
+
+
 MOST_SLIP = 9.0  # of that square
+ASTRAY = 0.2  # cosine of the heading off the line, under which a car faces backwards
 HISTORY = 16  # knots; a longer pure delay is cut off
 # Throttle, and steering as a part of the lock.
-HELD = tuple((throttle, side) for throttle in (-1.0, -0.5, 0.5) for side in (-1.0, 0.0, 1.0))
+HELD = tuple((throttle, side) for throttle in (-1.0, -0.5, 0.5, 1.0) for side in (-1.0, 0.0, 1.0))
 SEEN = ("x", "y", "heading", "vx", "vy", "yaw_rate")
 
 
@@ -141,14 +151,14 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
     weight = jnp.where(bend == 0, costs.straight, 1.0) * jnp.minimum(speed, 1.0)
     # Too much is a spin to come: it counts more than too little.
     much = jnp.where(bend * off < 0, costs.excess, 1.0)
-    slips = weight * jnp.minimum(much * off**2, MOST_SLIP)
+    facing = cosine * ground.along_x[row] + sine * ground.along_y[row]
+    # A car that faces backwards has to turn, whatever its sideslip: else to stand would cost least.
+    ahead = jnp.clip(facing / ASTRAY, 0.0, 1.0)
+    slips = weight * ahead * jnp.minimum(much * off**2, MOST_SLIP)
     out_x, out_y = ground.out_x[row], ground.out_y[row]
     beyond = jnp.arctan2(out_x * sine - out_y * cosine, out_x * cosine + out_y * sine)
     over = jnp.maximum(bend * beyond, 0.0) ** 2
-    east, north = cosine * motion.vx - sine * motion.vy, sine * motion.vx + cosine * motion.vy
-    forward = (east * ground.along_x[row] + north * ground.along_y[row]) / speed
-    facing = cosine * ground.along_x[row] + sine * ground.along_y[row]
-    against = jnp.maximum(0.3 - forward, 0.0) + jnp.maximum(0.2 - facing, 0.0)
+    against = jnp.maximum(ASTRAY - facing, 0.0)
     changes = jnp.diff(commands.throttle) ** 2 + (jnp.diff(commands.steering) / problem.lock) ** 2
     arrived = jnp.where(places > problem.goal, 1.0, 0.0)
     left = jnp.minimum(end, problem.goal) - jnp.minimum(place, problem.goal)
@@ -227,17 +237,24 @@ def costs_of(
     return jnp.where(jnp.isfinite(found), found, jnp.inf)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def decide(
+def weighed(
     mesh: Mesh, samples: int, problem: Problem, memory: Memory, motion: Motion
-) -> tuple[Command, Memory]:
-    """The command of the next knot, and the memory after it."""
+) -> tuple[Array, Scalar, Command, Array, Array]:
+    """The next key, the place, and the sequences of a decision with their costs and weights."""
     key, fresh = jax.random.split(jax.random.wrap_key_data(memory.key))
     place = problem.ground.follow(motion.x, motion.y, memory.place)
     drawn = draw(problem, fresh, memory.commands, samples)
     found = costs_of(mesh, problem, place, motion, memory.given, drawn)
     weights = jnp.exp((jnp.min(found) - found) / problem.search.temperature)
-    weights = weights / jnp.sum(weights)
+    return jax.random.key_data(key), place, drawn, found, weights / jnp.sum(weights)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def decide(
+    mesh: Mesh, samples: int, problem: Problem, memory: Memory, motion: Motion
+) -> tuple[Command, Memory]:
+    """The command of the next knot, and the memory after it."""
+    key, place, drawn, _, weights = weighed(mesh, samples, problem, memory, motion)
     plan = jax.tree.map(lambda lines: weights @ lines, drawn)
     command = jax.tree.map(lambda line: line[0], plan)
     # Where the model will be when the next command is given.
@@ -245,7 +262,22 @@ def decide(
     after = jax.tree.map(lambda leaf: leaf[-1], drive(problem, motion, memory.given, first))
     moved = jax.tree.map(lambda line: jnp.append(line[1:], line[-1]), plan)
     given = jax.tree.map(lambda line, new: jnp.append(line[1:], new), memory.given, command)
-    return command, Memory(jax.random.key_data(key), after, place, moved, given)
+    return command, Memory(key, after, place, moved, given)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def look(
+    mesh: Mesh, samples: int, count: int, problem: Problem, memory: Memory, motion: Motion
+) -> Rollouts:
+    """The first `count` sequences of a decision, and its plan, driven on the plant."""
+    _, _, drawn, found, weights = weighed(mesh, samples, problem, memory, motion)
+    plan = jax.tree.map(lambda lines: weights @ lines, drawn)
+
+    def on(commands: Command) -> Motion:
+        return drive(problem, motion, memory.given, commands)
+
+    some = jax.vmap(on)(jax.tree.map(lambda lines: lines[:count], drawn))
+    return Rollouts(some, found[:count], weights[:count], on(plan))
 
 
 def problem_of(
@@ -307,6 +339,14 @@ class Mppi:
             motion = self._now(memory.motion, observation)
             command, memory = decide(self._mesh, self._samples, self._problem, memory, motion)
         return Command(float(command.throttle), float(command.steering)), memory
+
+    def rollouts(self, memory: Memory, observation: Observation, count: int) -> Rollouts:
+        """The first `count` sequences that `act` draws for the same arguments."""
+        with jax.enable_x64(False):
+            motion = self._now(memory.motion, observation)
+            seen = look(self._mesh, self._samples, count, self._problem, memory, motion)
+        found: Rollouts = jax.tree.map(np.asarray, seen)
+        return found
 
     def _now(self, predicted: Motion, observation: Observation) -> Motion:
         """The prediction with the estimate's pose and velocities. Wheels keep their slip."""
