@@ -25,8 +25,8 @@ from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
 from countersteer.course.course import Course
 from countersteer.course.files import load_course
+from countersteer.course.way import SPACING, way_of
 from countersteer.pilot import Pilot
-from countersteer.planning.ground import SPACING, ground_of
 from countersteer.planning.mppi import Mppi
 from countersteer.simulator import Simulator
 from countersteer.task.judge import Outcome, Task, samples
@@ -39,11 +39,11 @@ DRIFT = 25.0  # degrees of sideslip, from which a turn is a drift
 
 def bends_of(course: Course) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """The points of the rounded line (n, 2), and the first and last row of each bend."""
-    ground = ground_of(course)
-    rows = int(ground.last) + 1
-    edges = np.flatnonzero(np.diff(ground.bend[:rows], prepend=0.0, append=0.0))
-    bends = [(int(a), int(b)) for a, b in itertools.pairwise(edges) if ground.bend[a] != 0]
-    return np.stack([ground.x, ground.y], axis=1)[:rows], bends
+    way = way_of(course)
+    rows = int(way.last) + 1
+    edges = np.flatnonzero(np.diff(way.bend[:rows], prepend=0.0, append=0.0))
+    bends = [(int(a), int(b)) for a, b in itertools.pairwise(edges) if way.bend[a] != 0]
+    return np.stack([way.x, way.y], axis=1)[:rows], bends
 
 
 def drives(name: str, seeds: range) -> list[dict[str, Any]]:

@@ -37,8 +37,12 @@ MAY_IMPORT = {
         "car", "course", "world", "sensing", "link", "pilot", "simulator", "task",
         "estimation", "drivers",  # what open drives are told of the truth
     },
+    "envs": {
+        "car", "course", "world", "sensing", "link", "simulator", "task", "batch",
+        "drivers",  # what a network is told
+    },
     "learning": {
-        "car", "course", "pilot", "task", "runs", "batch",
+        "car", "course", "pilot", "task", "runs", "batch", "envs", "link",
         "drivers",  # what is learned is a driver's numbers
         "experiments",  # from which it learns
     },

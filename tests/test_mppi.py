@@ -9,11 +9,12 @@ import pytest
 
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
+from countersteer.course.way import SPACING, start_of, way_of
 from countersteer.errors import InputError
 from countersteer.pilot import Pilot
 from countersteer.planning import mppi, optimum
-from countersteer.planning.ground import SPACING, ground_of, start_of
-from countersteer.planning.mppi import KNOTS, Costs, Mppi, Problem, Search
+from countersteer.planning.clearance import clearance_of
+from countersteer.planning.mppi import KNOTS, Costs, Mppi, Problem, Search, problem_of
 from countersteer.signals import Command, Motion, Wheels
 from countersteer.simulator import Simulator
 from countersteer.task.judge import Outcome, Task, samples
@@ -28,8 +29,8 @@ def in_32_bits():
 
 
 def problem(course: str = "box", **costs: float) -> Problem:
-    made = Problem(CAR, ground_of(load_course(course)), Costs(**costs), Search(), 0.45, math.inf)
-    return jax.tree.map(jnp.asarray, made)
+    made, _ = problem_of(load_course(course), CAR, 1, Costs(**costs), Search())
+    return jax.tree.map(jnp.asarray, made._replace(lock=0.45, goal=math.inf))
 
 
 def straight_on(x: float, y: float, vx: float, knots: int = KNOTS) -> Motion:
@@ -50,36 +51,37 @@ def resting() -> Command:
 @pytest.mark.parametrize("name", ["box", "ess"])
 def test_a_place_on_the_line_is_found_again(name: str) -> None:
     course = load_course(name)
-    ground = ground_of(course)
-    assert float(ground.follow(*course.start[:2], start_of(course, ground))) == pytest.approx(
-        start_of(course, ground), abs=SPACING
+    way = way_of(course)
+    assert float(way.follow(*course.start[:2], start_of(course, way))) == pytest.approx(
+        start_of(course, way), abs=SPACING
     )
-    place = start_of(course, ground)
+    place = start_of(course, way)
     for row in range(int(place / SPACING), int(place / SPACING) + 200, 7):
-        x, y = (table[row % max(int(ground.last) + 1, 1)] for table in (ground.x, ground.y))
-        place = float(ground.follow(x, y, place))
+        x, y = (table[row % max(int(way.last) + 1, 1)] for table in (way.x, way.y))
+        place = float(way.follow(x, y, place))
         assert place == pytest.approx(SPACING * row, abs=2 * SPACING)
 
 
 def test_the_bends_of_a_course_have_their_sign_and_their_way_out() -> None:
-    ground = ground_of(load_course("box"))
-    driven = slice(0, int(ground.last) + 1)
-    assert set(np.unique(ground.bend[driven])) == {-1.0, 0.0}  # it turns to the right
-    turned = ground.along_x * ground.out_y - ground.along_y * ground.out_x
-    assert np.all(turned[driven][ground.bend[driven] < 0] <= 1e-6)
+    way = way_of(load_course("box"))
+    driven = slice(0, int(way.last) + 1)
+    assert set(np.unique(way.bend[driven])) == {-1.0, 0.0}  # it turns to the right
+    turned = way.along_x * way.out_y - way.along_y * way.out_x
+    assert np.all(turned[driven][way.bend[driven] < 0] <= 1e-6)
 
 
 def test_clearances_are_distances_to_the_walls_and_negative_beyond_them() -> None:
     course = load_course("box")
-    ground = ground_of(course)
+    way = way_of(course)
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-0.6, 3.6, 300), rng.uniform(-3.6, 0.6, 300)
     ends, ways = course.walls[:, :2], course.walls[:, 2:] - course.walls[:, :2]
     part = np.sum((np.stack([x, y], 1)[:, None] - ends) * ways, -1) / np.sum(ways**2, -1)
     foot = ends + np.clip(part, 0, 1)[..., None] * ways
     away = np.linalg.norm(np.stack([x, y], 1)[:, None] - foot, axis=-1).min(axis=1)
-    found = np.asarray(ground.clear(x, y))
-    np.testing.assert_allclose(np.abs(found), away, atol=1.5 * float(ground.cell))
+    grid = clearance_of(course, way)
+    found = np.asarray(grid.clear(x, y))
+    np.testing.assert_allclose(np.abs(found), away, atol=1.5 * float(grid.cell))
     within = (np.abs(x - 1.5) < 0.7) & (np.abs(y + 1.5) < 0.7)  # the block in the middle
     assert np.all(found[within] < 0)
     assert np.all(found[~within & (away > 0.05) & (np.abs(x - 1.5) > 0.9)] > 0)
@@ -87,7 +89,7 @@ def test_clearances_are_distances_to_the_walls_and_negative_beyond_them() -> Non
 
 def test_each_term_of_the_cost_counts_what_it_says() -> None:
     none = dict.fromkeys(Costs._fields, 0.0) | {"margin": 0.08, "drift": 0.6}
-    place = start_of(load_course("box"), ground_of(load_course("box")))
+    place = start_of(load_course("box"), way_of(load_course("box")))
     x, _, _ = load_course("box").start
     slow, fast = straight_on(x, 0, 0.5), straight_on(x, 0, 1.2)
     aside, through = straight_on(x, 0.55, 0.5), straight_on(x, 0.9, 0.5)

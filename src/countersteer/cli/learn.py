@@ -36,6 +36,18 @@ def add(verbs: Verbs) -> None:
     turn.seed()
     turn.out_file("POLICY.toml", "policy")
 
+    does = "a network that drives a course, by PPO in the simulator, with random cars"
+    ppo = learn("ppo", does, run_ppo)
+    ppo.add_argument("course", metavar="COURSE", help="as for drive")
+    ppo.option("--car", None, str, "rx7", "the nominal one")
+    ppo.option("--cars", "SET", str, "around", "as for evaluate")
+    meaning = "millions of decisions of 20 ms to learn from; some 3 a minute or more on two cores"
+    ppo.option("--samples", "M", number(0.1, 10_000), 30.0, meaning)
+    meaning = "how a term of the reward counts, such as 'sideslip=5' (repeatable)"
+    ppo.option("--reward", "TERM=WEIGHT", str, [], meaning, action="append")
+    ppo.seed()
+    ppo.out_file("POLICY.npz", "policy")
+
     does = "the best open-loop commands for a car that is wholly known: a yardstick for drivers"
     best = learn("optimum", does, run_optimum)
     best.add_argument("course", metavar="COURSE", help="as for drive")
@@ -133,6 +145,65 @@ def learn_turn(options: argparse.Namespace) -> int:
         if told["no_drift"]:
             print(f"{Path(options.car).stem} {told['no_drift']}")
     print(f"policy: {options.out}")
+    return DONE
+
+
+def run_ppo(options: argparse.Namespace) -> int:
+    """`learn ppo`."""
+    with out_file(options.out, ".npz"):
+        return learn_ppo(options)
+
+
+def learn_ppo(options: argparse.Namespace) -> int:
+    """The training of a network. Killed, the same command goes on from the last checkpoint."""
+    from countersteer.batch.engine import flags
+
+    cores = os.cpu_count() or 1
+    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    from countersteer.batch.evaluate import table_lines
+    from countersteer.batch.population import load_population
+    from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
+    from countersteer.course.files import load_course
+    from countersteer.errors import InputError
+
+    configure_jax(blocks=True, cores=cores)
+    try:
+        from countersteer.learning import ppo
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"learn ppo needs {error.name}: pip install 'countersteer[learn]'"
+        ) from None
+
+    course, car = load_course(options.course), load_car(options.car)
+    job = ppo.Job(
+        course,
+        Path(options.car).stem,
+        car,
+        options.cars,
+        load_population(options.cars),
+        ppo.weights_of(options.reward),
+        options.seed,
+        round(options.samples * 1e6),
+    )
+
+    def report(told: dict[str, float]) -> None:
+        if not options.json:
+            print(ppo.line(told), flush=True)
+
+    curves = ppo.train(job, options.out, cores, report)
+    # Seeds that training has not used.
+    found = ppo.verdict(job, options.out, UNSEEN + options.seed)
+    files = {"policy": str(options.out), "curves": str(options.out.with_suffix(".csv"))}
+    if options.json:
+        print(json.dumps(files | {"training": curves, "verdict": found}))
+        return DONE
+    print("\n".join(["in new trials, on ground truth:", *table_lines({course.name: found})]))
+    print(f"policy: {files['policy']}; curves: {options.out.with_suffix('.png')}, .csv")
+    print(
+        f"to see it: countersteer drive {options.course} --car {options.car} "
+        f"--driver {options.out} --estimate truth"
+    )
     return DONE
 
 

@@ -1,3 +1,8 @@
 """Drivers: each computes commands from observations. One driver a file."""
 
-DRIVERS = ("drift-turn", "straighten", "pursuit")  # of the library; `plan.library` names its plans
+DRIVERS = (
+    "drift-turn",
+    "straighten",
+    "pursuit",
+    "ppo",
+)  # of the library; `plan.library` names its plans

@@ -8,7 +8,7 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers import DRIVERS, own, plan, policy
+from countersteer.drivers import DRIVERS, network, own, plan, policy
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
@@ -32,8 +32,8 @@ def make_driver(
 ) -> tuple[Driver, dict[str, Any]]:
     """A driver for a course and a nominal car, and its tables for `driver_of_tables`.
 
-    `name` is one of the library, a policy or plan `.toml`, a `commands.csv`, which `read` reads, or
-    `FILE.py:CLASS`.
+    `name` is one of the library, a policy `.npz`, a policy or plan `.toml`, a `commands.csv`, which
+    `read` reads, or `FILE.py:CLASS`.
     `speed` (m/s) is the speed that it should bring to a turn. The tables of a `commands.csv` are a
     record only: they make no driver. Raises `InputError`.
     """
@@ -48,6 +48,9 @@ def make_driver(
         return own.own_driver(name, course, car, speed, laps), {"kind": "python", "name": name}
     if name in ("straighten", "pursuit"):
         tables = {"kind": name, **tables}
+    elif name == network.KIND or name.endswith(".npz"):
+        file = network.policy_for(course, car) if name == network.KIND else Path(name)
+        tables = {"kind": network.KIND, "file": str(file), **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
         kind = numbers.get("kind")
@@ -58,7 +61,7 @@ def make_driver(
         known = [*DRIVERS, *plan.library(), *own.installed()]
         raise InputError(
             f"no driver {short(name)}{nearest(name, known)}: give one of {', '.join(known)}, a "
-            "policy or plan .toml, a commands.csv, or FILE.py:CLASS"
+            "policy .npz, a policy or plan .toml, a commands.csv, or FILE.py:CLASS"
         )
     return driver_of_tables(tables, course, car, laps, read), tables
 
@@ -75,6 +78,14 @@ def driver_of_tables(
         return straighten(course, car, speed)
     if kind == "pursuit":
         return pursuit(course, car, speed)
+    if kind == network.KIND:
+        if speed is not None:
+            raise InputError(
+                f"--speed-mps: {short(where)} has its own speed, and is asked for none"
+            )
+        layers, about = network.read_network(Path(where))
+        network.check_for(short(where), about, course, car)
+        return network.network_driver(course, car, layers)
     if kind == policy.KIND and numbers:
         return drift_turn(course, car, speed, laps, *policy.policy_of_tables(numbers, where))
     raise InputError(f"{short(where)}: no driver of kind {shown(kind)} can be made from plain data")

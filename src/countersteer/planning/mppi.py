@@ -23,8 +23,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
+from countersteer.course.way import Way, start_of, way_of
 from countersteer.drivers.driver import Observation
-from countersteer.planning.ground import Ground, ground_of, start_of
+from countersteer.planning.clearance import Clearance, clearance_of
 from countersteer.signals import Array, Command, Motion, Scalar, Wheels
 from countersteer.world import plant
 
@@ -70,7 +71,8 @@ class Problem(NamedTuple):
     """All that a plan is made for, as 32-bit arrays."""
 
     car: Car
-    ground: Ground
+    way: Way
+    clearance: Clearance
     costs: Costs
     search: Search
     lock: Scalar  # rad, full steering
@@ -125,37 +127,37 @@ def drive(
 
 def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> Scalar:
     """J of a drive (leaves (knots,)) that began at a place."""
-    ground, costs, body = problem.ground, problem.costs, problem.car.body
+    way, costs, body = problem.way, problem.costs, problem.car.body
 
     def on(place: Scalar, at: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
-        place = ground.follow(*at, place)
+        place = way.follow(*at, place)
         return place, place
 
     end, places = jax.lax.scan(on, place, (motion.x, motion.y))
-    row = ground.row(places)
+    row = way.row(places)
     cosine, sine = jnp.cos(motion.heading), jnp.sin(motion.heading)
     nearest = jnp.full_like(motion.x, jnp.inf)
     for ahead in (body.center + body.length / 2, body.center - body.length / 2):
         for left in (body.width / 2, -body.width / 2):
             corner_x = motion.x + cosine * ahead - sine * left
             corner_y = motion.y + sine * ahead + cosine * left
-            nearest = jnp.minimum(nearest, ground.clear(corner_x, corner_y))
+            nearest = jnp.minimum(nearest, problem.clearance.clear(corner_x, corner_y))
     close = jnp.clip((costs.margin - nearest) / costs.margin, 0.0, 3.0) ** 2
     # A drive that has met a wall is over.
     hit = jnp.cumsum(jnp.where(nearest <= 0, 1.0, 0.0)) > 0
 
-    bend = ground.bend[row]
+    bend = way.bend[row]
     speed = jnp.sqrt(motion.vx**2 + motion.vy**2) + 0.1
     # Nose in, by `drift`, in a corner; straight elsewhere.
     off = (jnp.arctan2(motion.vy, motion.vx) + bend * costs.drift) / costs.drift
     weight = jnp.where(bend == 0, costs.straight, 1.0) * jnp.minimum(speed, 1.0)
     # Too much is a spin to come: it counts more than too little.
     much = jnp.where(bend * off < 0, costs.excess, 1.0)
-    facing = cosine * ground.along_x[row] + sine * ground.along_y[row]
+    facing = cosine * way.along_x[row] + sine * way.along_y[row]
     # A car that faces backwards has to turn, whatever its sideslip: else to stand would cost least.
     ahead = jnp.clip(facing / ASTRAY, 0.0, 1.0)
     slips = weight * ahead * jnp.minimum(much * off**2, MOST_SLIP)
-    out_x, out_y = ground.out_x[row], ground.out_y[row]
+    out_x, out_y = way.out_x[row], way.out_y[row]
     beyond = jnp.arctan2(out_x * sine - out_y * cosine, out_x * cosine + out_y * sine)
     over = jnp.maximum(bend * beyond, 0.0) ** 2
     against = jnp.maximum(ASTRAY - facing, 0.0)
@@ -242,7 +244,7 @@ def weighed(
 ) -> tuple[Array, Scalar, Command, Array, Array]:
     """The next key, the place, and the sequences of a decision with their costs and weights."""
     key, fresh = jax.random.split(jax.random.wrap_key_data(memory.key))
-    place = problem.ground.follow(motion.x, motion.y, memory.place)
+    place = problem.way.follow(motion.x, motion.y, memory.place)
     drawn = draw(problem, fresh, memory.commands, samples)
     found = costs_of(mesh, problem, place, motion, memory.given, drawn)
     weights = jnp.exp((jnp.min(found) - found) / problem.search.temperature)
@@ -284,11 +286,11 @@ def problem_of(
     course: Course, car: Car, laps: int, costs: Costs, search: Search
 ) -> tuple[Problem, float]:
     """The problem of a course and a nominal car, and the place of the start (m)."""
-    ground = ground_of(course)
+    way = way_of(course)
     lock = min(float(car.servo.limit_left), float(car.servo.limit_right))
-    place, end = start_of(course, ground), course.lap_end(laps)
+    place, end = start_of(course, way), course.lap_end(laps)
     goal = math.inf if end is None else place + end - course.start_distance
-    return Problem(car, ground, costs, search, lock, goal), place
+    return Problem(car, way, clearance_of(course, way), costs, search, lock, goal), place
 
 
 def at_rest(pose: tuple[Scalar, Scalar, Scalar]) -> Motion:

@@ -1,4 +1,7 @@
-"""A course as a planner needs it: tables in which a thousand cars at once look up their place."""
+"""The way along a course: its centre line with rounded corners, as tables.
+
+Planners and policies follow it. A thousand cars look up their place at once.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -15,15 +18,12 @@ SPACING = 0.02  # m between two points of the line
 ROUNDING = 0.3  # corridor widths: standard deviation by which the line's corners are rounded
 AHEAD = 0.5  # corridor widths: so far ahead a corner's outgoing direction is looked for
 STRAIGHT_ON = 4.0  # m, by which an open course goes on before its start and behind its end
-CELL = 0.02  # m, of the grid of clearances
-MARGIN = 0.5  # m, of the grid around the walls
-MOST_CELLS = 4_000_000
 TABLE = 1024  # rows, or a multiple: courses share programs
 STRAIGHT = 0.2  # 1/m, curvature from which a place is in a corner
 
 
-class Ground(NamedTuple):
-    """The line of a course, rounded, with a point every `SPACING`; and a grid of clearances."""
+class Way(NamedTuple):
+    """The line of a course, rounded, with a point every `SPACING`."""
 
     x: Array  # (n,) m
     y: Array
@@ -34,16 +34,19 @@ class Ground(NamedTuple):
     out_y: Array
     last: Scalar  # index of the last point
     whole: Scalar  # points of a lap, or 0 where the course is open
-    clearance: Array  # (rows, columns) m from the nearest wall, negative beyond it
-    corner_x: Scalar  # of the grid's first cell's middle, m
-    corner_y: Scalar
-    cell: Scalar  # m
 
     def row(self, place: Scalar) -> Scalar:
         """The row of a place (m along the line from its first point)."""
         index = jnp.round(place / SPACING).astype(jnp.int32)
         wrapped = jnp.where(self.whole > 0, index % jnp.maximum(self.whole, 1), index)
         return jnp.clip(wrapped, 0, self.last)
+
+    def point(self, place: Scalar) -> tuple[Scalar, Scalar]:
+        """The point at a place (m): that of its row, moved on along the line."""
+        row = self.row(place)
+        # Of a closed line, the place counts from the row on, whatever the lap.
+        on = place - SPACING * jnp.round(place / SPACING)
+        return self.x[row] + on * self.along_x[row], self.y[row] + on * self.along_y[row]
 
     def follow(self, x: Scalar, y: Scalar, place: Scalar) -> Scalar:
         """The place of a point, near a place of before: two steps of projection on the line."""
@@ -53,18 +56,11 @@ class Ground(NamedTuple):
             place = place + jnp.clip(ahead, -0.5, 0.5)
         return place
 
-    def clear(self, x: Scalar, y: Scalar) -> Scalar:
-        """Distance of a point to the nearest wall (m), in steps of a cell; negative beyond it."""
-        rows, columns = self.clearance.shape
-        column = jnp.round((x - self.corner_x) / self.cell).astype(jnp.int32)
-        row = jnp.round((y - self.corner_y) / self.cell).astype(jnp.int32)
-        return self.clearance[jnp.clip(row, 0, rows - 1), jnp.clip(column, 0, columns - 1)]
 
-
-def ground_of(course: Course) -> Ground:
+def way_of(course: Course) -> Way:
     """The tables of a course with a centre line, in 32 bits. Raises `InputError` for free walls."""
     if not len(course.line):
-        raise InputError(f"{course.name}: free walls have no centre line for a planner to follow")
+        raise InputError(f"{course.name}: free walls have no centre line to follow")
     width = course.width or 1.0
     points = _even(course)
     sigma = ROUNDING * width / SPACING
@@ -83,20 +79,18 @@ def ground_of(course: Course) -> Ground:
         out = bearing[ahead % len(points)] + lap * (ahead // len(points))
     else:
         out = bearing[np.minimum(ahead, len(points) - 1)]
-    clearance, corner, cell = _clearances(course, points)
     columns = (*points.T, np.cos(bearing), np.sin(bearing), bend, np.cos(out), np.sin(out))
     rows = math.ceil(len(points) / TABLE) * TABLE
     tables = [np.append(c, np.full(rows - len(c), c[-1])).astype(np.float32) for c in columns]
     whole = np.int32(len(points) if course.closed else 0)
-    grid = clearance.astype(np.float32), *map(np.float32, (*corner, cell))
-    parts: list[Any] = [*tables, np.int32(len(points) - 1), whole, *grid]
-    return Ground(*parts)
+    parts: list[Any] = [*tables, np.int32(len(points) - 1), whole]
+    return Way(*parts)
 
 
-def start_of(course: Course, ground: Ground) -> float:
+def start_of(course: Course, way: Way) -> float:
     """The place of a course's start (m)."""
     x, y, _ = course.start
-    away = np.hypot(ground.x[: ground.last + 1] - x, ground.y[: ground.last + 1] - y)
+    away = np.hypot(way.x[: way.last + 1] - x, way.y[: way.last + 1] - y)
     return SPACING * int(np.argmin(away))
 
 
@@ -111,24 +105,3 @@ def _even(course: Course) -> np.ndarray:
     count = math.ceil(marks[-1] / SPACING)
     at = np.linspace(0.0, marks[-1], count, endpoint=not course.closed)
     return np.stack([np.interp(at, marks, line[:, i]) for i in (0, 1)], axis=1)
-
-
-def _clearances(course: Course, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Clearances on a grid around the walls, its first cell's place, and the size of a cell."""
-    ends = course.walls.reshape(-1, 2)
-    low, high = ends.min(axis=0) - MARGIN, ends.max(axis=0) + MARGIN
-    cell = max(CELL, math.sqrt(float(np.prod(high - low)) / MOST_CELLS))
-    columns, rows = np.ceil((high - low) / cell).astype(int) + 1
-    solid = np.zeros((rows, columns), bool)
-    for ax, ay, bx, by in course.walls:
-        steps = max(2, math.ceil(2 * math.hypot(bx - ax, by - ay) / cell))
-        xs, ys = np.linspace(ax, bx, steps), np.linspace(ay, by, steps)
-        index = np.round((np.stack([ys, xs], axis=1) - low[::-1]) / cell).astype(int)
-        solid[index[:, 0], index[:, 1]] = True
-    regions, _ = ndimage.label(~solid)
-    index = np.round((points[:, ::-1] - low[::-1]) / cell).astype(int)
-    inside = np.all((index >= 0) & (index < [rows, columns]), axis=1)
-    driven = np.unique(regions[index[inside, 0], index[inside, 1]])
-    free = np.isin(regions, driven[driven > 0])
-    away = np.asarray(ndimage.distance_transform_edt(~solid)) * cell
-    return np.where(free, away, -away), low, cell

@@ -1,0 +1,134 @@
+"""The Gymnasium vector environment: thousands of cars, stepped on all cores in one program.
+
+Each sub-environment has a car of its own, drawn at `reset`, and keeps it. Autoreset is
+`NEXT_STEP`: the step after an episode's end begins a new one, ignores the action, and returns a
+reward of 0. `terminated` is the judge's end; `truncated` the limit of time.
+"""
+
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from countersteer.batch import engine
+from countersteer.batch.population import load_population
+from countersteer.car.files import load_car
+from countersteer.compiling import configure_jax
+from countersteer.course.files import load_course
+from countersteer.drivers.network import FAR, FEATURES, PERIOD
+from countersteer.envs.functional import Environment, Lane, Own, owns
+from countersteer.signals import Array, Scalar
+from countersteer.task.reward import DRIFTING, Reward
+
+LONGEST = 15.0  # s
+
+
+class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
+    """Many cars on one course, with the true state as observation. See `single.DriftEnv`."""
+
+    metadata = {  # noqa: RUF012  # Gymnasium's form
+        "render_modes": [],
+        "render_fps": round(1 / PERIOD),
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1024,
+        course: str = "box",
+        car: str = "rx7",
+        cars: str = "around",
+        weights: Reward = DRIFTING,
+        laps: int = 1,
+        longest: float = LONGEST,
+        cores: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Raises `InputError` for a wrong name. `cores` is 1, or the number JAX has devices for."""
+        if render_mode is not None:
+            raise ValueError("a vector environment is not rendered: make one of its cars alone")
+        configure_jax(blocks=True, cores=os.cpu_count() or 1)
+        self.num_envs, self.longest = num_envs, longest
+        self.course, self.car = load_course(course), load_car(car)
+        self.course.check_laps(laps)
+        self.population, self._weights, self._laps = load_population(cars), weights, laps
+        self.single_observation_space = spaces.Box(-FAR, FAR, (FEATURES,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        cores = cores or len(jax.devices())
+        block = min(engine.CACHED_LANES, max(1, num_envs // cores))
+        # Whole blocks on each core: the lanes beyond the wanted ones are driven and not shown.
+        self._lanes = engine.whole_blocks(num_envs, block, cores)
+        self._step = engine.in_one_program(_step, lanes=block, cores=cores)
+        self._reset = jax.jit(jax.vmap(Environment.reset, (None, 0, 0, None)))
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,  # noqa: ARG002  # Gymnasium's form
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Draw a car for each sub-environment, and begin. The same seed repeats all exactly."""
+        super().reset(seed=seed)
+        first = int(self.np_random.integers(2**30)) if seed is None else seed * self._lanes
+        seeds = [(first + i) % 2**31 for i in range(self._lanes)]
+        own: Own
+        own, slots = owns(self.population, self.car, self.course, seeds)
+        self._environment = Environment.of(self.course, self.car, self._weights, slots, self._laps)
+        root = jax.random.key(first % 2**31)
+        self._keys = jax.random.key_data(jax.random.split(root, self._lanes))
+        self._tick = 0
+        state, seen = self._reset(
+            self._environment, own, jax.random.wrap_key_data(self._keys), np.int32(0)
+        )
+        self._state: Lane = state
+        self._done = np.zeros(self._lanes, np.float32)
+        return np.asarray(seen)[: self.num_envs], {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One decision of 20 ms of all cars; `infos` has the reward's terms and the outcomes."""
+        full = np.zeros((self._lanes, 2), np.float32)
+        full[: self.num_envs] = actions
+        own = (self._state, self._keys, full, self._done)
+        self._state, seen, terms, ended = self._step(own, self._environment, np.int32(self._tick))
+        self._tick += self._environment.ticks
+        n, score = self.num_envs, self._state.score
+        late = (np.asarray(score.time) >= self.longest - 1e-4) & (np.asarray(ended) == 0)
+        terminated = np.asarray(ended)[:n] > 0
+        self._done = np.where(late | (np.asarray(ended) > 0), 1.0, 0.0).astype(np.float32)
+        infos = {name: np.asarray(part)[:n] for name, part in terms._asdict().items()}
+        infos["outcome"] = np.asarray(score.outcome)[:n]
+        return (
+            np.asarray(seen)[:n],
+            np.asarray(terms.total, np.float32)[:n],
+            terminated,
+            late[:n],
+            infos,
+        )
+
+
+def _step(
+    own: tuple[Lane, Array, Array, Array], environment: Environment, tick: Scalar
+) -> tuple[Lane, Array, Reward, Scalar]:
+    """A block's decision. Lanes that had ended begin a new episode instead."""
+    lanes, keys, actions, done = own
+
+    def fresh(key: Array) -> Array:
+        return jax.random.uniform(
+            jax.random.fold_in(jax.random.wrap_key_data(key), tick), (5,), jnp.float32
+        )
+
+    after, _, terms, ended = jax.vmap(environment.step, (0, 0, None))(lanes, actions, tick)
+    end = tick + environment.ticks
+    after = jax.vmap(environment.renewed, (0, 0, 0, None))(after, done, jax.vmap(fresh)(keys), end)
+    goes = 1 - done
+    terms = jax.tree.map(lambda term: goes * term, terms)
+    return after, jax.vmap(environment.observe)(after), terms, goes * ended
