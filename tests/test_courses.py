@@ -17,8 +17,9 @@ from scipy.spatial import KDTree
 
 from countersteer import cli
 from countersteer.car.files import load_car
-from countersteer.course.course import Course
+from countersteer.course.course import Course, from_segments, progress
 from countersteer.course.files import course_of_run, course_tables, load_course
+from countersteer.course.position import line_of
 from countersteer.errors import InputError
 
 HEADER = "# x_m, y_m, w_tr_right_m, w_tr_left_m\n"
@@ -459,3 +460,27 @@ def test_the_example_says_in_one_line_what_it_cannot_lap(grip_limit, capsys, mon
         grip_limit.main()
     assert ended.value.code == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("angle", [90.0, 120.0, 135.0])
+def test_a_car_that_cuts_a_sharp_corner_does_not_lose_its_place(angle):
+    """Its place on the line jumps as it crosses the bisector, by nearly w tan(a / 2)."""
+    bend = math.radians(angle)
+    course = from_segments(
+        "sharp", 1.4, False, [("straight", 6.0, 0.0), ("turn", bend, 0.0), ("straight", 6.0, 0.0)]
+    )
+    inside = 0.62  # m off the centre line: a car's half width from the inner wall
+    turn = np.array([math.cos(bend), math.sin(bend)])
+    left = np.array([-turn[1], turn[0]])
+    first = np.stack(
+        [np.linspace(1.0, 6.0 - inside * math.tan(bend / 2), 200), np.full(200, inside)], 1
+    )
+    along = np.linspace(inside * math.tan(bend / 2), 5.0, 200)[:, None]
+    then = np.array([6.0, 0.0]) + along * turn + inside * left
+    xs, ys = np.concatenate([first, then]).T
+    found = progress(course, xs, ys, 1.0)
+    assert found[-1] == pytest.approx(11.0, abs=1e-6)
+    line, place = line_of(course), 1.0
+    for x, y in zip(xs, ys, strict=True):
+        place = float(line.follow(x, y, place).distance)
+    assert place == pytest.approx(11.0, abs=1e-6)

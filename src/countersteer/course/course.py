@@ -17,6 +17,9 @@ ARC_STEP = math.radians(5)  # largest angle of a chord of a rounded corner
 MOST_WALLS = 8192
 
 
+SHARPEST = math.radians(150)  # of a mitred corner, beyond which nobody cuts it whole
+
+
 class Turn(NamedTuple):
     """A corner of the centre line."""
 
@@ -288,18 +291,29 @@ def place(course: Course, distance: float) -> tuple[float, float, float]:
     return float(x), float(y), float(math.atan2(step[1], step[0]))
 
 
+def follow_within(course: Course) -> float:
+    """The largest way along the centre line (m) that a car may move on at once.
+
+    It is 1.5 corridor widths w, and more where a mitred corner of angle a is sharp: a car that cuts
+    it close to the inner wall passes nearly w tan(a / 2) of the line as it crosses the bisector.
+    """
+    sharp = [abs(turn.angle) for turn in course.turns if not turn.radius]
+    cut = math.tan(min(max(sharp, default=0.0), SHARPEST) / 2)
+    return (course.width or 1.0) * max(1.5, 1.15 * cut)
+
+
 def progress(course: Course, xs: np.ndarray, ys: np.ndarray, last: float) -> np.ndarray:
     """Unwrapped distance along the centre line of each position, starting from `last`.
 
-    Each position goes to the nearest place of the line within 1.5 corridor widths of the place
-    before. So neither a neighbouring straight nor the start line confuses it.
+    Each position goes to the nearest place of the line within `follow_within` of the place before.
+    So neither a neighbouring straight nor the start line confuses it.
     """
     if not len(course.line):
         return np.zeros(len(xs))
     marks, steps = course.marks[:-1], np.diff(course.line, axis=0)
     lengths = np.hypot(*steps.T)
     along = steps / lengths[:, None]
-    near = 1.5 * (course.width or 1.0)
+    near = follow_within(course)
     found = np.empty(len(xs))
     for n, (x, y) in enumerate(zip(xs, ys, strict=True)):
         on = np.clip((np.array([x, y]) - course.line[:-1]) * along @ [1.0, 1.0], 0.0, lengths)

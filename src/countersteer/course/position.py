@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from countersteer.course.course import Course, place
+from countersteer.course.course import Course, follow_within, place
 from countersteer.signals import Array, Scalar
 
 FAR = 1e3  # m, length of the last leg
@@ -114,7 +114,7 @@ def line_of(course: Course, dtype: Any = np.float64) -> Line:
         lengths,
         course.marks[:-1],
         course.length if course.closed else math.inf,
-        1.5 * (course.width or 1.0),
+        follow_within(course),
         course.start_distance,
     )
     return Line(*(np.asarray(value, dtype) for value in values))
