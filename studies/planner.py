@@ -57,12 +57,13 @@ def drives(name: str, seeds: range) -> list[dict[str, Any]]:
     found = []
     for i, seed in enumerate(seeds):
         alone, floor = jax.tree.map(lambda leaf, at=i: leaf[at], (drawn.cars, drawn.floor))
+        x, y, heading = map(float, drawn.pose[i])
         simulator = Simulator.of(
             course,
             alone,
             seed=seed,
             charge=float(drawn.charge[i]),
-            start=tuple(map(float, drawn.pose[i])),
+            start=(x, y, heading),
             floor=floor,
         )
         score, slips = task.init(), np.zeros(len(bends))

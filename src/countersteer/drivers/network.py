@@ -162,10 +162,10 @@ def network_driver(course: Course, car: Car, layers: tuple[Layer, ...]) -> Netwo
     return NetworkDriver(way=way, place=start_of(course, way), layers=layers, lock=full_lock(car))
 
 
-def network_arrays(layers: tuple[Layer, ...], about: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def network_arrays(layers: tuple[Layer, ...], about: Mapping[str, Any]) -> dict[str, Any]:
     """The content of a network's file: `about` tells course, car and where it is from."""
     told = {"kind": KIND, "format": FORMAT, "features": FEATURES, **about}
-    found = {"about": np.frombuffer(json.dumps(told).encode(), np.uint8)}
+    found: dict[str, Any] = {"about": np.frombuffer(json.dumps(told).encode(), np.uint8)}
     for i, layer in enumerate(layers):
         found |= {f"weight_{i}": np.asarray(layer.weight), f"bias_{i}": np.asarray(layer.bias)}
     return found
@@ -189,7 +189,8 @@ def read_network(path: Path) -> tuple[tuple[Layer, ...], dict[str, Any]]:
             f"{where}: is of another version (format {shown(about.get('format'))}, "
             f"{shown(about.get('features'))} features): learn it again with 'learn ppo'"
         )
-    layers, width = [], FEATURES
+    layers: list[Layer] = []
+    width = FEATURES
     while len(layers) < len(held) // 2:
         try:
             layer = Layer(held[f"weight_{len(layers)}"], held[f"bias_{len(layers)}"])

@@ -119,9 +119,9 @@ class Environment:
         )
         x, y, heading = (jnp.where(rolling > 0, b, a) for a, b in zip(own.pose, there, strict=True))
         speed, still = rolling * ROLLING * even[4], jnp.zeros_like(rolling)
-        state = planar.initial_state(
-            own.car, DT, (x, y, heading), (speed, still, still), own.charge, self.slots
-        )
+        pose: Any = (x, y, heading)
+        velocity: Any = (speed, still, still)
+        state = planar.initial_state(own.car, DT, pose, velocity, own.charge, self.slots)
         state = jax.tree.map(
             lambda leaf: jnp.asarray(leaf) if jnp.ndim(leaf) else leaf + still, state
         )

@@ -21,7 +21,7 @@ def save(path: Path, about: Mapping[str, Any], state: Any, curves: list[dict[str
     """Write a checkpoint. `about` tells what must be the same for the training to go on."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
     told = {"about": dict(about), "curves": curves}
-    arrays = {f"leaf_{i}": leaf for i, leaf in enumerate(leaves)}
+    arrays: dict[str, Any] = {f"leaf_{i}": leaf for i, leaf in enumerate(leaves)}
     buffer = io.BytesIO()
     np.savez(buffer, told=np.frombuffer(json.dumps(told).encode(), np.uint8), **arrays)
     write_whole(path, buffer.getvalue())

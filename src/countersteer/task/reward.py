@@ -22,14 +22,14 @@ class Reward(NamedTuple):
     The first three are the paper's.
     """
 
-    time: float = -1.0  # a second
-    road: float = -10.0  # for a drive that fails: a wall, a roll-over, no progress
-    goal: float = 10.0  # for reaching it
-    progress: float = 0.0  # a metre along the centre line that the car was not at before
-    sideslip: float = 0.0  # for a turn with `ENOUGH` sideslip at its peak, in proportion to less
-    drift: float = 0.0  # for a turn that becomes a drift
-    overshoot: float = 0.0  # a radian by which the heading goes beyond the corridor's, negative
-    smoothness: float = 0.0  # of the square of a command's change, in full commands, negative
+    time: Scalar = -1.0  # a second
+    road: Scalar = -10.0  # for a drive that fails: a wall, a roll-over, no progress
+    goal: Scalar = 10.0  # for reaching it
+    progress: Scalar = 0.0  # a metre along the centre line that the car was not at before
+    sideslip: Scalar = 0.0  # for a turn with `ENOUGH` sideslip at its peak, in proportion to less
+    drift: Scalar = 0.0  # for a turn that becomes a drift
+    overshoot: Scalar = 0.0  # a radian by which the heading goes beyond the corridor's, negative
+    smoothness: Scalar = 0.0  # of the square of a command's change, in full commands, negative
 
     @property
     def total(self) -> Scalar:
