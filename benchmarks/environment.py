@@ -1,0 +1,120 @@
+"""The environments beside the bare physics: ticks a second, in turns in one run.
+
+    python -m benchmarks.environment [LANES] [ROUNDS]
+
+All sides drive the same random cars, with their floors and walls, in blocks on all cores: the bare
+physics with a held command; the functional environment with a held action, and with a policy of two
+layers of 64; and the Gymnasium vector environment, which goes through NumPy at each decision.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from countersteer.batch import engine
+from countersteer.batch.population import load_population
+from countersteer.car.files import load_car
+from countersteer.compiling import configure_jax
+from countersteer.course.files import load_course
+from countersteer.drivers.network import FEATURES, Layer, network
+from countersteer.envs.functional import DT, Environment, owns
+from countersteer.envs.vector import DriftVectorEnv
+from countersteer.signals import Command
+from countersteer.task.reward import DRIFTING
+from countersteer.world import planar
+
+LANES, ROUNDS = 4096, 7
+DECISIONS = 16  # in one call of a program
+HELD = (0.3, -0.2)
+
+
+def programs(lanes: int, cores: int) -> dict[str, Callable[[], Any]]:
+    """What is timed, by name. Each call drives all lanes for `DECISIONS`."""
+    course, car = load_course("box"), load_car("rx7")
+    own, slots = owns(load_population("around"), car, course, range(lanes))
+    environment = Environment.of(course, car, DRIFTING, slots)
+    keys = jax.random.split(jax.random.key(0), lanes)
+    begun = jax.jit(jax.vmap(Environment.reset, (None, 0, 0, None)))
+    state, _ = begun(environment, own, keys, np.int32(0))
+    rng = np.random.default_rng(0)
+    sizes = ((FEATURES, 64), (64, 64), (64, 2))
+    layers = tuple(
+        Layer(rng.normal(0, 0.1, s).astype(np.float32), np.zeros(s[1], np.float32)) for s in sizes
+    )
+
+    def bare(lanes: Any, environment: Environment, layers: Any) -> Any:
+        del layers
+        command = Command(jnp.float32(HELD[0]), environment.lock * jnp.float32(HELD[1]))
+
+        def tick(state: Any, count: Any) -> tuple[Any, None]:
+            def one(own: Any, state: Any) -> Any:
+                return planar.step(own.car, environment.walls, state, command, count, DT, own.floor)
+
+            return jax.vmap(one)(lanes.own, state), None
+
+        ticks = DECISIONS * environment.ticks
+        return jax.lax.scan(tick, lanes.state, jnp.arange(ticks, dtype=jnp.int32))[0]
+
+    def held(with_policy: bool) -> Any:
+        def run(lanes: Any, environment: Environment, layers: Any) -> Any:
+            def one(carry: Any, number: Any) -> tuple[Any, Any]:
+                lanes, seen = carry
+                action = jnp.broadcast_to(jnp.float32(HELD), (seen.shape[0], 2))
+                if with_policy:
+                    action = network(layers, seen)
+                now = number * environment.ticks
+                lanes, seen, terms, ended = jax.vmap(environment.step, (0, 0, None))(
+                    lanes, action, now
+                )
+                even = jnp.full((seen.shape[0], 5), 0.5, jnp.float32)
+                renewed = jax.vmap(environment.renewed, (0, 0, 0, None))
+                lanes = renewed(lanes, ended, even, now + environment.ticks)
+                return (lanes, seen), terms.total
+
+            begin = (lanes, jax.vmap(environment.observe)(lanes))
+            (lanes, _), paid = jax.lax.scan(one, begin, jnp.arange(DECISIONS, dtype=jnp.int32))
+            return lanes, paid.T
+
+        return run
+
+    found: dict[str, Callable[[], Any]] = {}
+    sides = {"bare physics": bare, "environment": held(False), "environment, policy": held(True)}
+    for name, run in sides.items():
+        program = engine.in_one_program(run, cores=cores)
+        found[name] = lambda program=program: program(state, environment, layers)
+    many = DriftVectorEnv(lanes)
+    many.reset(seed=0)
+    actions = np.tile(np.float32(HELD), (lanes, 1))
+    found["Gymnasium, vector"] = lambda: [many.step(actions) for _ in range(DECISIONS)]
+    return found
+
+
+def main(lanes: int = LANES, rounds: int = ROUNDS) -> int:
+    """Print medians, and shares of the bare physics."""
+    cores = os.cpu_count() or 1
+    os.environ["XLA_FLAGS"] = engine.flags(cores)
+    configure_jax(blocks=True, cores=cores)
+    sides = programs(lanes, cores)
+    times: dict[str, list[float]] = {name: [] for name in sides}
+    for number in range(rounds + 1):
+        for name, call in sides.items():
+            begun = time.perf_counter()
+            jax.block_until_ready(call())
+            if number:  # the first compiles
+                times[name].append(time.perf_counter() - begun)
+    ticks = lanes * DECISIONS * 20
+    base = float(np.median(times["bare physics"]))
+    for name, spent in times.items():
+        middle = float(np.median(spent))
+        print(f"{name:22} {ticks / middle / 1e6:6.2f} M ticks/s, {100 * base / middle:5.1f} %")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(*map(int, sys.argv[1:])))
