@@ -7,7 +7,7 @@ READY := .venv/ready
 # What a drive needs; `make test` and the rest add to it. Modules are compiled when they are imported.
 DRIVES := .venv/drives
 
-.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook clean
+.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook sb3 clean
 
 drive: $(DRIVES)
 	$(BIN)/countersteer drive box
@@ -43,6 +43,11 @@ hostile: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks.speed docs/speed.md
+
+# PyTorch is 200 MB: only the test of Stable-Baselines3 needs it, and skips without.
+sb3: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints.txt --editable '.[dev,sb3]'
 
 # Jupyter is some thirty packages: only who changes the notebook needs it.
 notebook: $(READY)
