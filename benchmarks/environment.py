@@ -22,7 +22,7 @@ from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
-from countersteer.drivers.network import FEATURES, Layer, network
+from countersteer.drivers.ppo import FEATURES, Layer, network
 from countersteer.envs.functional import DT, Environment, owns
 from countersteer.envs.vector import DriftVectorEnv
 from countersteer.signals import Command

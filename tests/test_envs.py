@@ -11,7 +11,7 @@ import pytest
 from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
-from countersteer.drivers.network import FEATURES
+from countersteer.drivers.ppo import FEATURES
 from countersteer.task.judge import Outcome
 from countersteer.task.reward import DRIFTING, PAPER, Reward
 

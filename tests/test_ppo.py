@@ -17,8 +17,8 @@ from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.car.parameter import pytree
 from countersteer.course.files import load_course
-from countersteer.drivers import network
-from countersteer.drivers.network import FEATURES, Layer, read_network
+from countersteer.drivers import ppo as network
+from countersteer.drivers.ppo import FEATURES, Layer, read_network
 from countersteer.errors import InputError
 from countersteer.learning import checkpoint, ppo
 from countersteer.learning.ppo import Job, Met, Settings, Trainer, advantages

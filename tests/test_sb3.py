@@ -5,10 +5,10 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
 
-from stable_baselines3 import PPO  # noqa: E402
-from stable_baselines3.common.env_checker import check_env  # noqa: E402
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
 
-from countersteer.envs.single import DriftEnv  # noqa: E402
+from countersteer.envs.single import DriftEnv
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # theirs
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers import DRIVERS, network, own, plan, policy
+from countersteer.drivers import DRIVERS, own, plan, policy, ppo
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
@@ -48,9 +48,9 @@ def make_driver(
         return own.own_driver(name, course, car, speed, laps), {"kind": "python", "name": name}
     if name in ("straighten", "pursuit"):
         tables = {"kind": name, **tables}
-    elif name == network.KIND or name.endswith(".npz"):
-        file = network.policy_for(course, car) if name == network.KIND else Path(name)
-        tables = {"kind": network.KIND, "file": str(file), **tables}
+    elif name == ppo.KIND or name.endswith(".npz"):
+        file = ppo.policy_for(course, car) if name == ppo.KIND else Path(name)
+        tables = {"kind": ppo.KIND, "file": str(file), **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
         kind = numbers.get("kind")
@@ -78,14 +78,14 @@ def driver_of_tables(
         return straighten(course, car, speed)
     if kind == "pursuit":
         return pursuit(course, car, speed)
-    if kind == network.KIND:
+    if kind == ppo.KIND:
         if speed is not None:
             raise InputError(
                 f"--speed-mps: {short(where)} has its own speed, and is asked for none"
             )
-        layers, about = network.read_network(Path(where))
-        network.check_for(short(where), about, course, car)
-        return network.network_driver(course, car, layers)
+        layers, about = ppo.read_network(Path(where))
+        ppo.check_for(short(where), about, course, car)
+        return ppo.network_driver(course, car, layers)
     if kind == policy.KIND and numbers:
         return drift_turn(course, car, speed, laps, *policy.policy_of_tables(numbers, where))
     raise InputError(f"{short(where)}: no driver of kind {shown(kind)} can be made from plain data")

@@ -1,7 +1,7 @@
 """The functional environment: pure `reset` and `step` of one car, for people who train in JAX.
 
 A decision is `Environment.ticks` ticks of the planar world with one command held, actuators, delays
-and walls as in a drive. The observation is `drivers.network.features` of the true state. The judge
+and walls as in a drive. The observation is `drivers.ppo.features` of the true state. The judge
 (`task.judge`) looks at each decision's end. So an episode ends as a drive does.
 
     lanes, seen = jax.vmap(environment.reset)(cars, keys)
@@ -22,7 +22,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.course.way import Way, start_of, way_of
-from countersteer.drivers.network import PERIOD, Past, Sight, features, full_lock
+from countersteer.drivers.ppo import PERIOD, Past, Sight, features, full_lock
 from countersteer.signals import Array, Command, Scalar
 from countersteer.task.judge import Outcome, Sample, Score, Task
 from countersteer.task.reward import Reward, reward

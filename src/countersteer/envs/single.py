@@ -16,7 +16,7 @@ from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
 from countersteer.course.way import start_of, way_of
-from countersteer.drivers.network import (
+from countersteer.drivers.ppo import (
     FAR,
     FEATURES,
     PAST,
@@ -45,7 +45,7 @@ class DriftEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """Drive a course to its goal.
 
     Action (2,) in ±1: throttle (negative: brake, reverse), steering to the left (±1: full lock).
-    Observation `state`: `drivers.network.features` of the true state. Observation `sensors`: the
+    Observation `state`: `drivers.ppo.features` of the true state. Observation `sensors`: the
     last value of each of the car's channels, in their order (`observation_names`), then the last
     four throttles and steerings. `info` has the reward's `terms`, the `outcome`, the `turns`' peak
     sideslip and overshoot (rad), and at `reset` the `seed` that drew the car.

@@ -20,7 +20,7 @@ from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
-from countersteer.drivers.network import FAR, FEATURES, PERIOD
+from countersteer.drivers.ppo import FAR, FEATURES, PERIOD
 from countersteer.envs.functional import Environment, Lane, Own, owns
 from countersteer.signals import Array, Scalar
 from countersteer.task.reward import DRIFTING, Reward

@@ -30,7 +30,7 @@ from countersteer.batch.evaluate import Trials, results
 from countersteer.batch.population import Population
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers.network import (
+from countersteer.drivers.ppo import (
     FEATURES,
     PERIOD,
     Layer,

@@ -1,6 +1,6 @@
-"""A driver that is a neural network: the estimate and the way ahead in, a command out.
+"""A neural network that PPO taught: the estimate and the way ahead in, a command out.
 
-The network is a multilayer perceptron with tanh units, learned by `learn ppo`. It decides every
+It is a multilayer perceptron with tanh units, learned by `learn ppo`. It decides every
 `PERIOD`. Its inputs are `features`. Its file is an `.npz` of plain arrays, which `read_network`
 reads without pickle.
 """
