@@ -7,6 +7,7 @@ physics with a held command; the functional environment with a held action, and 
 layers of 64; and the Gymnasium vector environment, which goes through NumPy at each decision.
 """
 
+import functools
 import os
 import sys
 import time
@@ -65,7 +66,7 @@ def programs(lanes: int, cores: int) -> dict[str, Callable[[], Any]]:
         def run(lanes: Any, environment: Environment, layers: Any) -> Any:
             def one(carry: Any, number: Any) -> tuple[Any, Any]:
                 lanes, seen = carry
-                action = jnp.broadcast_to(jnp.float32(HELD), (seen.shape[0], 2))
+                action = jnp.broadcast_to(jnp.asarray(HELD, jnp.float32), (seen.shape[0], 2))
                 if with_policy:
                     action = network(layers, seen)
                 now = number * environment.ticks
@@ -87,10 +88,10 @@ def programs(lanes: int, cores: int) -> dict[str, Callable[[], Any]]:
     sides = {"bare physics": bare, "environment": held(False), "environment, policy": held(True)}
     for name, run in sides.items():
         program = engine.in_one_program(run, cores=cores)
-        found[name] = lambda program=program: program(state, environment, layers)
+        found[name] = functools.partial(program, state, environment, layers)
     many = DriftVectorEnv(lanes)
     many.reset(seed=0)
-    actions = np.tile(np.float32(HELD), (lanes, 1))
+    actions = np.tile(np.asarray(HELD, np.float32), (lanes, 1))
     found["Gymnasium, vector"] = lambda: [many.step(actions) for _ in range(DECISIONS)]
     return found
 
