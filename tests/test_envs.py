@@ -18,10 +18,10 @@ from countersteer.task.reward import DRIFTING, PAPER, Reward
 gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
 
 from countersteer import envs  # noqa: E402  # it needs gymnasium
-from countersteer.envs.functional import Environment, Own, owns  # noqa: E402
-from countersteer.envs.single import DriftEnv  # noqa: E402
-from countersteer.envs.vector import DriftVectorEnv  # noqa: E402
-from countersteer.world import planar  # noqa: E402
+from countersteer.envs.functional import Environment, Own, owns  # noqa: E402  # after the skip
+from countersteer.envs.single import DriftEnv  # noqa: E402  # after the skip
+from countersteer.envs.vector import DriftVectorEnv  # noqa: E402  # after the skip
+from countersteer.world import planar  # noqa: E402  # after the skip
 
 CARS = load_population("around")
 

@@ -1,8 +1,8 @@
 """A neural network that PPO taught: the estimate and the way ahead in, a command out.
 
 It is a multilayer perceptron with tanh units, learned by `learn ppo`. It decides every
-`PERIOD`. Its inputs are `features`. Its file is an `.npz` of plain arrays, which `read_network`
-reads without pickle.
+`PERIOD`. Its inputs are `features`. Its file is an `.npz` of plain numbers: arrays
+of Python objects are refused (NumPy's default).
 """
 
 import hashlib
@@ -177,7 +177,7 @@ def read_network(path: Path) -> tuple[tuple[Layer, ...], dict[str, Any]]:
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"{where}: over {LARGEST / 1e6:.0f} MB, which no policy is")
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(path) as file:
             held = {name: file[name] for name in file.files}
         about = json.loads(held.pop("about").tobytes().decode())
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:

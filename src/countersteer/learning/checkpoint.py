@@ -39,7 +39,7 @@ def load(
         return None
     shapes, structure = jax.tree.flatten(like)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(path) as file:
             told = json.loads(file["told"].tobytes().decode())
             leaves = [file[f"leaf_{i}"] for i in range(len(shapes))]
         theirs, curves = told["about"], told["curves"]
