@@ -102,7 +102,7 @@ def test_each_term_of_the_cost_counts_what_it_says() -> None:
     assert cost(fast, progress=1) == pytest.approx(-1.2 * mppi.HORIZON, abs=0.05)
     assert cost(slow, clearance=1) == 0 < cost(aside, clearance=1)
     assert cost(aside, hit=1) == 0 < cost(through, hit=1)
-    back = slow._replace(vx=-slow.vx)
+    back = slow._replace(heading=slow.heading + math.pi)
     assert cost(slow, backwards=1) == 0 < cost(back, backwards=1)
     jerky = Command(jnp.tile(jnp.array([0.0, 1.0]), KNOTS // 2), jnp.zeros(KNOTS))
     assert cost(slow, smoothness=1) == 0

@@ -255,5 +255,5 @@ def policy_for(course: Course, car: Car) -> Path:
 
 def library() -> list[Path]:
     """The files of the library's policies."""
-    folder = Path(str(importlib.resources.files("countersteer.drivers") / "library"))
-    return sorted(folder.glob("ppo-*.npz"))
+    folder = Path(str(importlib.resources.files("countersteer.drivers") / "policies"))
+    return sorted(folder.glob("*.npz"))
