@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage
 
 from countersteer.course.course import Course
 from countersteer.errors import InputError
@@ -59,6 +58,8 @@ class Way(NamedTuple):
 
 def way_of(course: Course) -> Way:
     """The tables of a course with a centre line, in 32 bits. Raises `InputError` for free walls."""
+    from scipy import ndimage  # a tenth of a second, which a drive without a way need not wait for
+
     if not len(course.line):
         raise InputError(f"{course.name}: free walls have no centre line to follow")
     width = course.width or 1.0
