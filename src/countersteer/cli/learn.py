@@ -58,6 +58,12 @@ def add(verbs: Verbs) -> None:
     best.out_file("COMMANDS.csv", "list of commands")
 
 
+def say(options: argparse.Namespace, line: str) -> None:
+    """A line of progress, unless one JSON object is asked for."""
+    if not options.json:
+        print(line, flush=True)
+
+
 def run_stop_angle(options: argparse.Namespace) -> int:
     """`learn stop-angle`."""
     with out_file(options.out):
@@ -135,6 +141,7 @@ def learn_turn(options: argparse.Namespace) -> int:
         *policy,
         car=Path(options.car).stem,
     )
+    say(options, "judging it in new trials, which compiles for half a minute the first time")
     # Seeds that the search has not used.
     found = verdict(courses, car, population, policy, (UNSEEN + options.seed) % 2**31)
     if options.json:
@@ -191,7 +198,9 @@ def learn_ppo(options: argparse.Namespace) -> int:
         if not options.json:
             print(ppo.line(told), flush=True)
 
+    say(options, "the first iteration compiles for up to a minute the first time")
     curves = ppo.train(job, options.out, cores, report)
+    say(options, "judging it in new trials, which compiles for half a minute the first time")
     # Seeds that training has not used.
     found = ppo.verdict(job, options.out, UNSEEN + options.seed)
     files = {"policy": str(options.out), "curves": str(options.out.with_suffix(".csv"))}
@@ -229,9 +238,9 @@ def learn_optimum(options: argparse.Namespace) -> int:
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     course, car, laps = load_course(options.course), load_car(options.car), options.laps
     course.check_laps(laps)
-    if not options.json:
-        print("the planner drives first, some twenty seconds a lap", flush=True)
+    say(options, "the planner drives first, some twenty seconds a lap")
     begin = planned(course, car, laps)
+    say(options, "the search begins; its first round compiles for half a minute the first time")
     with Progress(options.json) as progress:
         found = best(
             course,
