@@ -198,6 +198,9 @@ def learn_ppo(options: argparse.Namespace) -> int:
         if not options.json:
             print(ppo.line(told), flush=True)
 
+    kept = ppo.checkpoint_of(options.out)
+    if kept.exists():
+        say(options, f"going on from {kept}")
     say(options, "the first iteration compiles for up to a minute the first time")
     curves = ppo.train(job, options.out, cores, report)
     say(options, "judging it in new trials, which compiles for half a minute the first time")

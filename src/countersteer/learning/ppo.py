@@ -423,6 +423,11 @@ def weights_of(changes: Sequence[str]) -> Reward:
     return weights
 
 
+def checkpoint_of(out: Path) -> Path:
+    """The checkpoint of a policy that is being learned."""
+    return out.with_suffix(".checkpoint.npz")
+
+
 def train(
     job: Job,
     out: Path,
@@ -441,7 +446,7 @@ def train(
     environment = Environment.of(job.course, job.car, job.weights, slots, rolling=ROLLING)
     iterations = math.ceil(job.samples / (settings.lanes * settings.steps))
     trainer = Trainer(environment, settings, iterations, cores)
-    kept = out.with_suffix(".checkpoint.npz")
+    kept = checkpoint_of(out)
     about = {
         "fingerprint": fingerprint(job.course, job.car),
         "cars": job.cars,
