@@ -53,7 +53,8 @@ def drives(name: str, seeds: range) -> list[dict[str, Any]]:
     drawn = draw(load_population("around"), car, course, seeds, np.float64)
     pilot = Pilot.of(Mppi(course, car), course, car, "truth")
     task = Task.of(course, 1, walls_end=True)
-    line, bends = bends_of(course)
+    points, bends = bends_of(course)
+    line = KDTree(points)
     found = []
     for i, seed in enumerate(seeds):
         alone, floor = jax.tree.map(lambda leaf, at=i: leaf[at], (drawn.cars, drawn.floor))
@@ -71,7 +72,7 @@ def drives(name: str, seeds: range) -> list[dict[str, Any]]:
             rows = np.nonzero(record.tick % 5 == 0)[0]
             score, _ = task.follow(score, samples(record, rows, simulator.dt))
             motion = jax.tree.map(lambda leaf, at=rows: leaf[at], record.motion)
-            near = KDTree(line).query(np.stack([motion.x, motion.y], axis=1))[1]
+            near = line.query(np.stack([motion.x, motion.y], axis=1))[1]
             slip = np.abs(np.degrees(sideslip(motion.vx, motion.vy)))
             for k, (first, last) in enumerate(bends):
                 within = slip[(near >= first) & (near < last)]

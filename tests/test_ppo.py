@@ -130,6 +130,22 @@ def test_the_best_action_is_found():
     assert np.all(np.exp(state.policy.log_scatter) < ppo.BEGIN_SCATTER)
 
 
+def test_no_two_decisions_draw_the_same_noise():
+    trainer, state = tiny(1, longest=7.0, prize=0.0, wanted=0.0, ends_after=np.inf)
+    noises = []
+    for iteration in range(4):
+        _, met, *_ = trainer._drive(
+            (state.lanes, state.keys), state.policy, trainer.environment, 0, np.int32(iteration)
+        )
+        mean = network.network(state.policy.actor, met.seen)
+        noises.append(np.asarray((met.action - mean) / np.exp(state.policy.log_scatter)))
+    drawn = np.round(np.stack(noises)[..., 0].ravel(), 4)
+    lanes_steps = 64 * trainer.settings.steps
+    assert drawn.size == 4 * lanes_steps
+    # Rounded normal numbers meet by chance now and then; one in two did when draws were shared.
+    assert len(np.unique(drawn)) > 0.9 * drawn.size
+
+
 def test_advantages_are_those_of_a_plain_loop():
     rng = np.random.default_rng(0)
     reward, values = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))

@@ -4,7 +4,7 @@ A decision is `Environment.ticks` ticks of the planar world with one command hel
 and walls as in a drive. The observation is `drivers.ppo.features` of the true state. The judge
 (`task.judge`) looks at each decision's end. So an episode ends as a drive does.
 
-    lanes, seen = jax.vmap(environment.reset)(cars, keys)
+    lanes, seen = jax.vmap(environment.reset, (0, 0, None))(own, keys, 0)
     lanes, seen, terms, ended = jax.vmap(environment.step, (0, 0, None))(lanes, actions, tick)
 
 All lanes share the clock: `tick` is the number of ticks since the first `reset`.
@@ -32,6 +32,8 @@ from countersteer.world.state import State
 from countersteer.world.walls import padded
 
 DT = 0.001  # s
+TICKS = round(PERIOD / DT)  # of a decision
+LONGEST = 15.0  # s, after which an episode is cut short by those who step it
 ROLLING = 2.5  # m/s, most at a start in motion
 ASIDE, ASKEW = 0.2, 0.2  # parts of the corridor's width, and rad, of a start in motion
 LEFT = 1.0  # m before the goal, up to which a start in motion may be
@@ -70,7 +72,7 @@ class Environment:
     lock: Scalar  # rad, full steering
     width: Scalar  # m, of the corridor
     rolling: Scalar  # part of the episodes that begin in motion, anywhere on the course
-    ticks: int = dataclasses.field(default=round(PERIOD / DT), metadata={"static": True})
+    ticks: int = dataclasses.field(default=TICKS, metadata={"static": True})
     slots: int = dataclasses.field(default=32, metadata={"static": True})
 
     @classmethod

@@ -26,6 +26,7 @@ from countersteer.drivers.ppo import (
     features,
     full_lock,
 )
+from countersteer.envs.functional import DT, LONGEST, TICKS
 from countersteer.envs.picture import Scene
 from countersteer.errors import InputError
 from countersteer.link.link import LINKS
@@ -37,8 +38,6 @@ from countersteer.task.reward import DRIFTING, Reward, reward
 
 OBSERVATIONS = ("state", "sensors")
 CONTROLS = ("throttle", "steering")  # the order of an action's two numbers, each in ±1
-LONGEST = 15.0  # s, after which an episode is truncated
-TICKS = 20  # of a decision
 
 
 class DriftEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -130,20 +129,19 @@ class DriftEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._loop, _ = self._simulator.apply(self._loop, command, TICKS)
         before = self._score
         last = Command(float(self._past.throttle[-1]), float(self._past.steering[-1]))
-        tick = int(self._loop.tick)
+        time = DT * int(self._loop.tick)
         motion = self._motion()
         events = self._simulator.world.events(self._loop.state)
         with jax.enable_x64(True):
             self._score = jax.tree.map(
-                np.asarray, _judged(self._task, before, tick * 0.001, motion, *events)
+                np.asarray, _judged(self._task, before, time, motion, *events)
             )
             found = _rewarded(self.weights, self._task, before, self._score, given, last)
-        terms = Reward(*map(float, found))
-        with jax.enable_x64(True):
             self._past = jax.tree.map(np.asarray, self._past.then(given, self._sight))
+        terms = Reward(*map(float, found))
         outcome = Outcome.of(self._score.outcome)
         terminated = outcome is not Outcome.DRIVING
-        truncated = not terminated and tick * 0.001 >= self.longest - 1e-9
+        truncated = not terminated and time >= self.longest - 1e-9
         info = {
             "terms": terms._asdict(),
             "outcome": outcome.value,

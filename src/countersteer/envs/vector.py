@@ -21,11 +21,9 @@ from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
 from countersteer.course.files import load_course
 from countersteer.drivers.ppo import FAR, FEATURES, PERIOD
-from countersteer.envs.functional import Environment, Lane, Own, owns
+from countersteer.envs.functional import LONGEST, Environment, Lane, Own, owns
 from countersteer.signals import Array, Scalar
 from countersteer.task.reward import DRIFTING, Reward
-
-LONGEST = 15.0  # s
 
 
 class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
@@ -101,15 +99,15 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self._state, seen, terms, ended = self._step(own, self._environment, np.int32(self._tick))
         self._tick += self._environment.ticks
         n, score = self.num_envs, self._state.score
-        late = (np.asarray(score.time) >= self.longest - 1e-4) & (np.asarray(ended) == 0)
-        terminated = np.asarray(ended)[:n] > 0
-        self._done = np.where(late | (np.asarray(ended) > 0), 1.0, 0.0).astype(np.float32)
+        over = np.asarray(ended) > 0
+        late = (np.asarray(score.time) >= self.longest - 1e-4) & ~over
+        self._done = (late | over).astype(np.float32)
         infos = {name: np.asarray(part)[:n] for name, part in terms._asdict().items()}
         infos["outcome"] = np.asarray(score.outcome)[:n]
         return (
             np.asarray(seen)[:n],
             np.asarray(terms.total, np.float32)[:n],
-            terminated,
+            over[:n],
             late[:n],
             infos,
         )

@@ -40,7 +40,7 @@ from countersteer.drivers.ppo import (
     network_driver,
     read_network,
 )
-from countersteer.envs.functional import Environment, Lane, Own, owns
+from countersteer.envs.functional import LONGEST, Environment, Lane, Own, owns
 from countersteer.errors import InputError
 from countersteer.learning import checkpoint
 from countersteer.link.link import ONBOARD
@@ -71,7 +71,7 @@ class Settings:
     value: float = 0.5  # weight of the value's loss
     norm: float = 0.5  # largest norm of a gradient
     mean: float = 0.02  # part of the running mean that the newest parameters are
-    longest: float = 15.0  # s of an episode
+    longest: float = LONGEST  # s of an episode
 
 
 class Policy(NamedTuple):
@@ -223,9 +223,7 @@ class Trainer:
 
     def iterate(self, training: Training) -> tuple[Training, dict[str, float]]:
         """One iteration, and its figures."""
-        tick = np.int32(
-            int(training.iteration) * self.settings.steps * self.environment.ticks % 2**30
-        )
+        tick = np.int32(int(training.iteration) * self.settings.steps * self.environment.ticks)
         (lanes, met, last, told) = self._drive(
             (training.lanes, training.keys),
             training.policy,
@@ -252,8 +250,7 @@ class Trainer:
         """A block of lanes, driven for `steps` decisions."""
         lanes, keys = own
         settings = self.settings
-        of_lanes = functools.partial(jax.vmap, in_axes=(0, 0, None))
-        number = iteration * settings.steps
+        number = iteration * (2 * settings.steps + 1)  # two draws a step, and one at the end
 
         def drawn(step: Scalar, shape: tuple[int, ...], kind: Any) -> Array:
             def one(key: Array) -> Array:
@@ -269,7 +266,7 @@ class Trainer:
             noise = drawn(2 * step, (2,), jax.random.normal)
             action = mean + jnp.exp(policy.log_scatter) * noise
             value = network(policy.critic, seen)[:, 0]
-            lanes, _, terms, ended = of_lanes(environment.step)(lanes, action, now)
+            lanes, _, terms, ended = jax.vmap(environment.step, (0, 0, None))(lanes, action, now)
             met = Met(
                 seen,
                 action,
