@@ -66,6 +66,8 @@ $(DRIVES): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
 		--constraint constraints.txt --editable .
+	@# Python 3.11 puts it into each environment, where nothing needs it.
+	@$(BIN)/python -m pip uninstall --quiet --yes setuptools 2>/dev/null || true
 	@touch $(DRIVES)
 
 $(READY): $(DRIVES)

@@ -156,8 +156,8 @@ def preload(what: str) -> None:
 
     ends = threading.Event()
 
-    def load() -> None:
-        for key, device, wide in wanted:
+    def load(programs: list[tuple[str, Any, bool]]) -> None:
+        for key, device, wide in programs:
             program = None  # then it is loaded or made again where it is needed
             with contextlib.suppress(BaseException):
                 if not ends.is_set():
@@ -165,15 +165,20 @@ def preload(what: str) -> None:
                         program = _read(key, device)
             _coming[key, device].set_result(program)
 
+    # The largest takes as long as all else: the others do not wait for it.
+    parts = [part for part in (wanted[:1], wanted[1:]) if part]
+    threads = [threading.Thread(target=load, args=(part,), daemon=True) for part in parts]
+
     def end() -> None:
         ends.set()
-        thread.join()
+        for thread in threads:
+            thread.join()
 
     # Python stops a thread that runs when it ends, and XLA aborts the process where one of its own
-    # functions is stopped. So the end waits for the program that is being loaded.
+    # functions is stopped. So the end waits for the programs that are being loaded.
     atexit.register(end)
-    thread = threading.Thread(target=load, daemon=True)
-    thread.start()
+    for thread in threads:
+        thread.start()
 
 
 def remember(what: str) -> None:
@@ -260,9 +265,11 @@ def _write(name: str, data: bytes) -> None:
 @contextlib.contextmanager
 def _without_lapack(exported: Any) -> Iterator[None]:
     """Spares JAX the import of SciPy's LAPACK (0.2 s), for a program that does not call it."""
-    if b"lapack" in exported.mlir_module_serialized or _INITIALIZE is None:
+    if _INITIALIZE is None:
         yield
         return
+    if b"lapack" in exported.mlir_module_serialized:
+        _INITIALIZE()  # here, since another thread may be inside this context
     linalg.initialize_lapack = lambda: None
     try:
         yield

@@ -92,13 +92,13 @@ def in_one_program(
 
     def on_core(own: Any, *shared: Any) -> Any:
         # A block's numbers are one array, so that the loop updates it in place.
-        numbers, unpack = _packed(own)
+        numbers, unpack = packed(own)
         shapes = jax.eval_shape(run, jax.tree.map(lambda leaf: leaf[:lanes], own), *shared)
         empty = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
-        _, unpack_result = _packed(empty)
+        _, unpack_result = packed(empty)
 
         def block(numbers: Any) -> Any:
-            return _packed(run(jax.vmap(unpack)(numbers), *shared))[0]
+            return packed(run(jax.vmap(unpack)(numbers), *shared))[0]
 
         after = jax.lax.map(block, numbers.reshape(-1, lanes, numbers.shape[-1]))
         return jax.vmap(unpack_result)(after.reshape(-1, after.shape[-1]))
@@ -109,8 +109,11 @@ def in_one_program(
     return jax.jit(whole)
 
 
-def _packed(trees: Any) -> tuple[Any, Callable[[Any], Any]]:
-    """A pytree of lanes as an array (lanes, numbers of one), and the inverse for one lane."""
+def packed(trees: Any) -> tuple[Any, Callable[[Any], Any]]:
+    """A pytree of lanes as an array (lanes, numbers of one), and the inverse for one lane.
+
+    Who calls a program often keeps the array between the calls: packing passes through all memory.
+    """
     _, unpack = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], trees))
     return jax.vmap(lambda tree: ravel_pytree(tree)[0])(trees), unpack
 

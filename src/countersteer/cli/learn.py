@@ -4,6 +4,7 @@ import argparse
 import json
 import math
 import os
+import time
 from pathlib import Path
 
 from countersteer.cli.options import DONE, Progress, Verbs, number, out_file
@@ -105,18 +106,23 @@ def learn_turn(options: argparse.Namespace) -> int:
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import load_policy, save_policy
+    from countersteer.learning.curves import save
     from countersteer.learning.turning import Generation, search, verdict
 
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     courses = [load_course(name) for name in options.courses]
     history: list[dict[str, float]] = []
 
+    begun = time.process_time()
+
     def report(number: int, found: Generation) -> None:
-        history.append(found._asdict())
+        done = {"generation": number + 1.0, "cpu_s": time.process_time() - begun}
+        history.append(done | found._asdict())
         if not options.json:
             print(
                 f"  {number + 1:3} of {options.generations}: cost {found.cost:.3f}, "
-                f"{100 * found.success_rate:.0f} % get round; best candidate {found.best_cost:.3f}",
+                f"{100 * found.success_rate:.0f} % get round, {100 * found.drift_share:.0f} % of "
+                f"them drift every turn; best candidate {found.best_cost:.3f}".replace("nan", "-"),
                 flush=True,
             )
 
@@ -141,6 +147,8 @@ def learn_turn(options: argparse.Namespace) -> int:
         *policy,
         car=Path(options.car).stem,
     )
+    panels = ("success_rate",), ("drift_share",), ("cost",), ("best_cost",)
+    save(history, options.out, words, "cpu_s", ("minutes of CPU time", 60.0), panels)
     say(options, "judging it in new trials, which compiles for half a minute the first time")
     # Seeds that the search has not used.
     found = verdict(courses, car, population, policy, (UNSEEN + options.seed) % 2**31)
@@ -151,7 +159,7 @@ def learn_turn(options: argparse.Namespace) -> int:
     for told in found.values():
         if told["no_drift"]:
             print(f"{Path(options.car).stem} {told['no_drift']}")
-    print(f"policy: {options.out}")
+    print(f"policy: {options.out}; curves: {options.out.with_suffix('.png')}, .csv")
     return DONE
 
 
@@ -233,6 +241,7 @@ def learn_optimum(options: argparse.Namespace) -> int:
     from countersteer.cli.recorded import summary_lines
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
+    from countersteer.drivers.ppo import fingerprint
     from countersteer.experiments.best_drive import best, judged, planned
     from countersteer.planning.mppi import KNOT
     from countersteer.runs.files import COMMANDS, command_rows, csv_text
@@ -260,6 +269,8 @@ def learn_optimum(options: argparse.Namespace) -> int:
     result = {
         "course": course.name,
         "car": options.car,
+        "laps": laps,
+        "fingerprint": fingerprint(course, car),
         "rounds": options.rounds,
         "seed": options.seed,
         "cost": found.cost,

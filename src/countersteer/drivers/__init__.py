@@ -5,4 +5,5 @@ DRIVERS = (
     "straighten",
     "pursuit",
     "ppo",
+    "optimum",
 )  # of the library; `plan.library` names its plans

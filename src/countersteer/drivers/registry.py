@@ -8,7 +8,7 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers import DRIVERS, own, plan, policy, ppo
+from countersteer.drivers import DRIVERS, optimum, own, plan, policy, ppo
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
@@ -37,10 +37,11 @@ def make_driver(
     `speed` (m/s) is the speed that it should bring to a turn. The tables of a `commands.csv` are a
     record only: they make no driver. Raises `InputError`.
     """
-    if name.endswith(".csv"):
+    if name.endswith(".csv") or name == "optimum":
         if speed is not None:
             raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
-        return replay(read(Path(name))), {"kind": "replay"}
+        file = Path(name) if name != "optimum" else optimum.commands_for(course, car, laps)
+        return replay(read(file)), {"kind": "replay"}
     tables: dict[str, Any] = {} if speed is None else {"speed_mps": speed}
     # Looking for what is installed takes longer than making a driver of the library.
     theirs = name not in DRIVERS and not name.endswith(".toml") and name in own.installed()

@@ -5,7 +5,9 @@ Each sub-environment has a car of its own, drawn at `reset`, and keeps it. Autor
 reward of 0. `terminated` is the judge's end; `truncated` the limit of time.
 """
 
+import functools
 import os
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -63,7 +65,7 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         block = min(engine.CACHED_LANES, max(1, num_envs // cores))
         # Whole blocks on each core: the lanes beyond the wanted ones are driven and not shown.
         self._lanes = engine.whole_blocks(num_envs, block, cores)
-        self._step = engine.in_one_program(_step, lanes=block, cores=cores)
+        self._block, self._cores, self._slots = block, cores, -1
         self._reset = jax.jit(jax.vmap(Environment.reset, (None, 0, 0, None)))
 
     def reset(
@@ -80,12 +82,16 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         own, slots = owns(self.population, self.car, self.course, seeds)
         self._environment = Environment.of(self.course, self.car, self._weights, slots, self._laps)
         root = jax.random.key(first % 2**31)
-        self._keys = jax.random.key_data(jax.random.split(root, self._lanes))
-        self._tick = 0
-        state, seen = self._reset(
-            self._environment, own, jax.random.wrap_key_data(self._keys), np.int32(0)
-        )
-        self._state: Lane = state
+        keys = jax.random.split(root, self._lanes)
+        state, seen = self._reset(self._environment, own, keys, np.int32(0))
+        self._keys, self._tick = jax.random.key_data(keys), 0
+        # What a car is stays; how it moves goes in and out of each step, as one array.
+        self._own, own_of = engine.packed(own)
+        self._state, lane_of = engine.packed(state._replace(own=()))
+        if slots != self._slots:
+            stepped = functools.partial(_step, own_of, lane_of)
+            self._step = engine.in_one_program(stepped, lanes=self._block, cores=self._cores)
+            self._slots = slots
         self._done = np.zeros(self._lanes, np.float32)
         return np.asarray(seen)[: self.num_envs], {}
 
@@ -95,38 +101,45 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         """One decision of 20 ms of all cars; `infos` has the reward's terms and the outcomes."""
         full = np.zeros((self._lanes, 2), np.float32)
         full[: self.num_envs] = actions
-        own = (self._state, self._keys, full, self._done)
-        self._state, seen, terms, ended = self._step(own, self._environment, np.int32(self._tick))
+        own = (self._own, self._state, self._keys, full, self._done)
+        self._state, told = self._step(own, self._environment, np.int32(self._tick))
         self._tick += self._environment.ticks
-        n, score = self.num_envs, self._state.score
-        over = np.asarray(ended) > 0
-        late = (np.asarray(score.time) >= self.longest - 1e-4) & ~over
+        seen, terms, ended, time, outcome = np.split(np.asarray(told), PARTS, axis=1)
+        over = ended[:, 0] > 0
+        late = (time[:, 0] >= self.longest - 1e-4) & ~over
         self._done = (late | over).astype(np.float32)
-        infos = {name: np.asarray(part)[:n] for name, part in terms._asdict().items()}
-        infos["outcome"] = np.asarray(score.outcome)[:n]
-        return (
-            np.asarray(seen)[:n],
-            np.asarray(terms.total, np.float32)[:n],
-            over[:n],
-            late[:n],
-            infos,
-        )
+        n = self.num_envs
+        infos = {name: terms[:n, i] for i, name in enumerate(Reward._fields)}
+        infos["outcome"] = outcome[:n, 0].astype(np.int32)
+        return seen[:n], terms[:n].sum(axis=1), over[:n], late[:n], infos
+
+
+# Columns of what a step tells: observation, the reward's terms, end, s of the episode, outcome.
+PARTS = np.cumsum([FEATURES, len(Reward._fields), 1, 1])
 
 
 def _step(
-    own: tuple[Lane, Array, Array, Array], environment: Environment, tick: Scalar
-) -> tuple[Lane, Array, Reward, Scalar]:
-    """A block's decision. Lanes that had ended begin a new episode instead."""
-    lanes, keys, actions, done = own
+    own_of: Callable[[Array], Own],
+    lane_of: Callable[[Array], Lane],
+    own: tuple[Array, Array, Array, Array, Array],
+    environment: Environment,
+    tick: Scalar,
+) -> tuple[Array, Array]:
+    """A block's decision. Lanes that had ended begin a new episode instead.
 
-    def fresh(key: Array) -> Array:
-        return jax.random.uniform(
-            jax.random.fold_in(jax.random.wrap_key_data(key), tick), (5,), jnp.float32
-        )
+    Returns the packed lanes, and what is told of each (`PARTS`).
+    """
 
-    after, _, terms, ended = jax.vmap(environment.step, (0, 0, None))(lanes, actions, tick)
-    end = tick + environment.ticks
-    after = jax.vmap(environment.renewed, (0, 0, 0, None))(after, done, jax.vmap(fresh)(keys), end)
-    goes = 1 - done
-    terms = jax.tree.map(lambda term: goes * term, terms)
-    return after, jax.vmap(environment.observe)(after), terms, goes * ended
+    def one(car: Array, state: Array, key: Array, action: Array, done: Scalar) -> Any:
+        lane = lane_of(state)._replace(own=own_of(car))
+        after, _, terms, ended = environment.step(lane, action, tick)
+        own_key = jax.random.fold_in(jax.random.wrap_key_data(key), tick)
+        fresh = jax.random.uniform(own_key, (5,), jnp.float32)
+        after = environment.renewed(after, done, fresh, tick + environment.ticks)
+        paid = (1 - done) * jnp.stack(terms)
+        rest = jnp.stack([(1 - done) * ended, after.score.time, after.score.outcome])
+        told = jnp.concatenate([environment.observe(after), paid, rest])
+        return after._replace(own=()), told
+
+    lanes, told = jax.vmap(one)(*own)
+    return engine.packed(lanes)[0], told

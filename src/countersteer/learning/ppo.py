@@ -43,12 +43,12 @@ from countersteer.drivers.ppo import (
 from countersteer.envs.functional import LONGEST, Environment, Lane, Own, owns
 from countersteer.errors import InputError
 from countersteer.learning import checkpoint
+from countersteer.learning.curves import save
 from countersteer.link.link import ONBOARD
-from countersteer.runs.files import csv_text
 from countersteer.signals import Array, Scalar
 from countersteer.task.judge import DRIFT, Outcome
 from countersteer.task.reward import DRIFTING, Reward
-from countersteer.writing import whole, write_whole
+from countersteer.writing import write_whole
 
 UNITS = (64, 64)
 BEGIN_SCATTER = 0.5  # standard deviation of the first actions, in full commands
@@ -398,6 +398,12 @@ FIRST = 20_000_000  # seed of the first car that is trained with
 APART = 100_000  # seeds between two trainings' cars
 TOLD = 10  # iterations between two reports, which are also checkpoints
 ROLLING = 0.5  # part of the episodes that begin in motion
+PANELS = (  # of the picture
+    ("success_rate", "drift_share"),
+    ("lap_time_s",),
+    tuple(f"{name}_per_s" for name in ("reward", *Reward._fields)),
+    ("scatter",),
+)
 
 
 def weights_of(changes: Sequence[str]) -> Reward:
@@ -490,11 +496,8 @@ def train(
     buffer = io.BytesIO()
     np.savez(buffer, **network_arrays(mean.actor, source))
     write_whole(out, buffer.getvalue())
-    columns = list(curves[0])
-    write_whole(
-        out.with_suffix(".csv"), csv_text(columns, [[c[key] for key in columns] for c in curves])
-    )
-    draw(curves, out.with_suffix(".png"), f"{job.course.name}, {job.car_name}, seed {job.seed}")
+    title = f"learn ppo: {job.course.name}, {job.car_name}, seed {job.seed}"
+    save(curves, out, title, "samples", ("million decisions", 1e6), PANELS)
     kept.unlink(missing_ok=True)
     return curves
 
@@ -523,32 +526,3 @@ def verdict(job: Job, policy: Path, first: int, count: int = 256) -> dict[str, A
         job.course, job.car, job.car, job.population, seeds, None, 1, ONBOARD, "truth", 0.001
     )
     return results(trials.run(lambda _: driver), seeds)
-
-
-def draw(curves: Sequence[dict[str, float]], path: Path, title: str) -> None:
-    """The curves as a picture."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    done = [told["samples"] / 1e6 for told in curves]
-    axes = figure.subplots(2, 2).flat
-    for ax, names in zip(
-        axes,
-        (
-            ("success_rate", "drift_share"),
-            ("lap_time_s",),
-            tuple(f"{name}_per_s" for name in ("reward", *Reward._fields)),
-            ("scatter",),
-        ),
-        strict=True,
-    ):
-        for name in names:
-            ax.plot(done, [told[name] for told in curves], label=name)
-        ax.set_xlabel("million decisions")
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
-    figure.suptitle(f"learn ppo: {title}")
-    with whole(path) as part:
-        figure.savefig(part, format="png", dpi=100)

@@ -75,6 +75,7 @@ class Generation(NamedTuple):
 
     cost: float
     success_rate: float
+    drift_share: float  # of the successes, those that drift in every turn
     best_cost: float
 
 
@@ -159,9 +160,12 @@ def search(
         each = cost(score, (course.lap_end(1) or 0.0) / BRISK).reshape(candidates, trials)
         costs = each.mean(axis=1)
         new = slice(0, trials - again)
-        won = np.mean(score.outcome[new] == Outcome.REACHED.code)
+        reached = score.outcome[new] == Outcome.REACHED.code
         elite = tried[np.argsort(costs)[:best]]
-        report(number, Generation(float(each[0, new].mean()), float(won), float(costs.min())))
+        slid = np.all(score.turns.peak_sideslip[new] > DRIFT, axis=1)
+        slid = float(np.mean(slid[reached])) if np.any(reached) else math.nan
+        cheapest = float(costs.min())
+        report(number, Generation(float(each[0, new].mean()), np.mean(reached), slid, cheapest))
         worst = np.argsort(-each[0, new])[: max(1, trials // 8)]
         kept = own.picked(worst).joined(old)
         hard[number % len(courses)] = kept.picked(np.arange(min(REMEMBERED, len(kept.seeds))))
