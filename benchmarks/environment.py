@@ -5,9 +5,13 @@
 All sides drive the same random cars, with their floors and walls, in blocks on all cores: the bare
 physics with a held command; the functional environment with a held action, and with a policy of two
 layers of 64; and the Gymnasium vector environment, which goes through NumPy at each decision.
+Beside them, where they are installed: the car of `countersteer bench` in MuJoCo, on all cores, and
+the drift environment of Gym-Khana, one car in one process, as its users step it. Their steps are
+not the same work: other cars, other laws, and 10 ms instead of 1 ms in Gym-Khana.
 """
 
 import functools
+import importlib.util
 import os
 import sys
 import time
@@ -33,10 +37,17 @@ from countersteer.world import planar
 LANES, ROUNDS = 4096, 7
 DECISIONS = 16  # in one call of a program
 HELD = (0.3, -0.2)
+KHANA_STEPS = 200
+KHANA = {  # its documentation's choice for drifting
+    "num_agents": 1,
+    "model": "std",
+    "control_input": ["accl", "steering_angle"],
+    "observation_config": {"type": "drift"},
+}
 
 
-def programs(lanes: int, cores: int) -> dict[str, Callable[[], Any]]:
-    """What is timed, by name. Each call drives all lanes for `DECISIONS`."""
+def programs(lanes: int, cores: int) -> dict[str, tuple[int, Callable[[], Any]]]:
+    """What is timed, by name: the steps of a call, and the call."""
     course, car = load_course("box"), load_car("rx7")
     own, slots = owns(load_population("around"), car, course, range(lanes))
     environment = Environment.of(course, car, DRIFTING, slots)
@@ -84,36 +95,63 @@ def programs(lanes: int, cores: int) -> dict[str, Callable[[], Any]]:
 
         return run
 
-    found: dict[str, Callable[[], Any]] = {}
+    found: dict[str, tuple[int, Callable[[], Any]]] = {}
+    ticks = lanes * DECISIONS * environment.ticks
     sides = {"bare physics": bare, "environment": held(False), "environment, policy": held(True)}
     for name, run in sides.items():
         program = engine.in_one_program(run, cores=cores)
-        found[name] = functools.partial(program, state, environment, layers)
+        found[name] = ticks, functools.partial(program, state, environment, layers)
     many = DriftVectorEnv(lanes)
     many.reset(seed=0)
     actions = np.tile(np.asarray(HELD, np.float32), (lanes, 1))
-    found["Gymnasium, vector"] = lambda: [many.step(actions) for _ in range(DECISIONS)]
+    found["Gymnasium, vector"] = ticks, lambda: [many.step(actions) for _ in range(DECISIONS)]
+    if importlib.util.find_spec("mujoco") is not None:
+        from countersteer.bench import mujoco_car
+
+        cars, steps = 64, 320
+        compiled = mujoco_car.model(car, course, DT)
+        found["MuJoCo"] = cars * steps, mujoco_car.batch(compiled, cars, steps, cores)
+    if importlib.util.find_spec("gymkhana") is not None:
+        found["Gym-Khana, drift"] = KHANA_STEPS, gym_khana()
     return found
 
 
+def gym_khana() -> Callable[[], Any]:
+    """Gym-Khana's drift environment with a held action, reset where an episode ends."""
+    import gymnasium
+    from gymkhana.envs.gymkhana_env import GKEnv
+
+    config = KHANA | {"params": GKEnv.f1tenth_std_drift_bias_params()}
+    env = gymnasium.make("gymkhana:gymkhana-v0", config=config)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape or (), np.float32)
+
+    def run() -> None:
+        for _ in range(KHANA_STEPS):
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return run
+
+
 def main(lanes: int = LANES, rounds: int = ROUNDS) -> int:
-    """Print medians, and shares of the bare physics."""
+    """Print steps a second, medians, and shares of the bare physics."""
     cores = os.cpu_count() or 1
     os.environ["XLA_FLAGS"] = engine.flags(cores)
     configure_jax(blocks=True, cores=cores)
     sides = programs(lanes, cores)
     times: dict[str, list[float]] = {name: [] for name in sides}
     for number in range(rounds + 1):
-        for name, call in sides.items():
+        for name, (_, call) in sides.items():
             begun = time.perf_counter()
             jax.block_until_ready(call())
             if number:  # the first compiles
                 times[name].append(time.perf_counter() - begun)
-    ticks = lanes * DECISIONS * 20
-    base = float(np.median(times["bare physics"]))
-    for name, spent in times.items():
-        middle = float(np.median(spent))
-        print(f"{name:22} {ticks / middle / 1e6:6.2f} M ticks/s, {100 * base / middle:5.1f} %")
+    rates = {name: sides[name][0] / float(np.median(spent)) for name, spent in times.items()}
+    for name, rate in rates.items():
+        share = 100 * rate / rates["bare physics"]
+        print(f"{name:22} {rate:12,.0f} steps/s, {share:8.3f} %")
     return 0
 
 
