@@ -18,7 +18,9 @@ from countersteer.writing import naming, write_whole
 log = logging.getLogger(__name__)
 
 COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
+SPEED_COMMANDS = ("time_s", "speed_mps", "steering_deg")  # of a car with a speed controller
 LARGEST_STEERING = 90.0  # degrees
+FASTEST = 100.0  # m/s, of a commanded speed
 LATEST = 1e6  # s, of a time; a clock of Unix time is beyond
 LONGEST = 3600.0  # s, of what is simulated on the commands of a log
 LARGEST = 1e20  # of a finite cell of a run; sums of squares of larger ones leave the floats
@@ -131,21 +133,37 @@ def read_measurements(path: Path, required: Iterable[str], recorded: bool = Fals
 def read_commands(path: Path, recorded: bool = False) -> Table:
     """Read a `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad).
 
-    `recorded` is as in `read_table`.
+    If it commands speeds, `speed` (m/s, negative in reverse) stands in place of `throttle`. A
+    direction is optional there. `recorded` is as in `read_table`.
     """
-    table = read_table(path, COMMANDS, text=("direction",), recorded=recorded)
+    table = read_table(path, ("time_s", "steering_deg"), text=("direction",), recorded=recorded)
+    by_speed = "speed_mps" in table
+    known = {*SPEED_COMMANDS, "direction"} if by_speed else COMMANDS
     for name in table:
-        if name not in COMMANDS:
-            raise InputError(f"{path}: unknown column {short(name)}; known: {', '.join(COMMANDS)}")
+        if by_speed and name == "throttle":
+            raise InputError(f"{path}: columns throttle and speed_mps: give one of the two")
+        if name not in known:
+            words = ", ".join((*COMMANDS, "speed_mps"))
+            raise InputError(f"{path}: unknown column {short(name)}; known: {words}")
+    for name in SPEED_COMMANDS if by_speed else COMMANDS:
+        if name not in table:
+            raise InputError(f"{path}: column {name} is missing")
     if not len(table):
         raise InputError(f"{path}: holds no command")
-    throttle, steering = table["throttle"], table["steering_deg"]
+    asked, steering = table["speed_mps" if by_speed else "throttle"], table["steering_deg"]
+    direction = table.get("direction", np.full(len(table), "forward"))
+    reverse = direction == "reverse"
     for wrong, message in (
+        (~np.isin(direction, ("forward", "reverse")), "direction must be forward or reverse"),
         (
-            ~np.isin(table["direction"], ("forward", "reverse")),
-            "direction must be forward or reverse",
+            ~((asked >= 0) & (asked <= 1)) & (not by_speed),
+            "throttle must be in [0, 1]; a speed in m/s goes into a column speed_mps",
         ),
-        (~((throttle >= 0) & (throttle <= 1)), "throttle must be in [0, 1]"),
+        (
+            ~(np.abs(asked) <= FASTEST) & by_speed,
+            f"speed_mps must be in [-{FASTEST:g}, {FASTEST:g}]",
+        ),
+        ((asked < 0) & reverse, "speed_mps is negative and direction is reverse: give one of them"),
         (
             ~(np.abs(steering) <= LARGEST_STEERING),
             f"steering_deg must be in [-{LARGEST_STEERING:g}, {LARGEST_STEERING:g}]",
@@ -154,8 +172,18 @@ def read_commands(path: Path, recorded: bool = False) -> Table:
     ):
         if np.any(wrong):
             raise InputError(f"{path}, line {_first(wrong)}: {message}")
-    sign = np.where(table["direction"] == "reverse", -1.0, 1.0)
-    return Table(time_s=table["time_s"], throttle=sign * throttle, steering=np.radians(steering))
+    column = {drive_column(table): np.where(reverse, -1.0, 1.0) * asked}
+    return Table(time_s=table["time_s"], **column, steering=np.radians(steering))
+
+
+def drive_column(commands: Iterable[str]) -> str:
+    """The column that commands the motor: `speed` of a car commanded in m/s, else `throttle`."""
+    return "speed" if {"speed", "speed_mps"} & set(commands) else "throttle"
+
+
+def speed_rows(time: np.ndarray, speed: np.ndarray, steering: np.ndarray) -> list[list[str]]:
+    """Rows of a `commands.csv` with speeds (m/s); steering in rad."""
+    return column_rows((time, speed, np.degrees(np.asarray(steering, float))))
 
 
 def command_rows(time: np.ndarray, throttle: np.ndarray, steering: np.ndarray) -> list[list[str]]:
