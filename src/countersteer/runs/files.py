@@ -36,20 +36,27 @@ class Table(dict[str, np.ndarray]):
 
 
 def read_table(
-    path: Path, required: Iterable[str], text: Sequence[str] = (), recorded: bool = False
+    path: Path,
+    required: Iterable[str],
+    text: Sequence[str] = (),
+    recorded: bool = False,
+    any_clock: bool = False,
 ) -> Table:
     """Read a CSV file with a header as columns of numbers; empty cells are NaN.
 
-    Columns named in `text` stay text. A last line that was cut off, by a killed process, is left
-    out with a logged warning: one with too few cells, or, if `TableWriter` `recorded` the file, one
+    Columns named in `text` stay text. With `any_clock`, times may be far from 0.
+
+    A last line that was cut off, by a killed process, is left out with a logged warning: one with too few cells, or, if `TableWriter` `recorded` the file, one
     that does not end. Raises `InputError` if a column is missing or appears twice; and, with the
     line, for a wrong number of cells, a cell that is no number, or a falling time.
     """
     with reading(path):
-        return _read_table(path, required, text, recorded)
+        return _read_table(path, required, text, recorded, any_clock)
 
 
-def _read_table(path: Path, required: Iterable[str], text: Sequence[str], recorded: bool) -> Table:
+def _read_table(
+    path: Path, required: Iterable[str], text: Sequence[str], recorded: bool, any_clock: bool
+) -> Table:
     content = read_text(path)
     lines = content.splitlines()
     while lines and not lines[-1].strip():
@@ -89,11 +96,12 @@ def _read_table(path: Path, required: Iterable[str], text: Sequence[str], record
         time = table["time_s"]
         if not np.all(np.isfinite(time)):
             raise InputError(f"{path}, line {_first(~np.isfinite(time))}: time_s is not a number")
-        if np.any(np.abs(time) > LATEST):
-            line, first = _first(np.abs(time) > LATEST), time[np.argmax(np.abs(time) > LATEST)]
+        latest = LARGEST if any_clock else LATEST
+        if np.any(np.abs(time) > latest):
+            line, first = _first(np.abs(time) > latest), time[np.argmax(np.abs(time) > latest)]
             raise InputError(
-                f"{path}, line {line}: time_s must be within {LATEST:g} s of 0, not {first:.10g}: "
-                "if it is Unix time, subtract the time at which the log begins from all its tables"
+                f"{path}, line {line}: time_s must be within {latest:g} s of 0, not {first:.10g}: "
+                "if it is Unix time, 'countersteer import run' moves the clock of all tables to 0"
             )
         if np.any(np.diff(time) < 0):
             line = _first(np.diff(time) < 0) + 1
@@ -114,12 +122,14 @@ def _first(where: np.ndarray) -> int:
     return int(np.argmax(where)) + 2
 
 
-def read_measurements(path: Path, required: Iterable[str], recorded: bool = False) -> Table:
+def read_measurements(
+    path: Path, required: Iterable[str], recorded: bool = False, any_clock: bool = False
+) -> Table:
     """Read a table of a run. Raises `InputError` for a finite number beyond `LARGEST` too.
 
-    `recorded` is as in `read_table`.
+    `recorded` and `any_clock` are as in `read_table`.
     """
-    table = read_table(path, required, recorded=recorded)
+    table = read_table(path, required, (), recorded, any_clock)
     for name, column in table.items():
         beyond = np.isfinite(column) & (np.abs(column) > LARGEST)
         if np.any(beyond):
@@ -130,13 +140,13 @@ def read_measurements(path: Path, required: Iterable[str], recorded: bool = Fals
     return table
 
 
-def read_commands(path: Path, recorded: bool = False) -> Table:
+def read_commands(path: Path, recorded: bool = False, any_clock: bool = False) -> Table:
     """Read a `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad).
 
     If it commands speeds, `speed` (m/s, negative in reverse) stands in place of `throttle`. A
-    direction is optional there. `recorded` is as in `read_table`.
+    direction is optional there. `recorded` and `any_clock` are as in `read_table`.
     """
-    table = read_table(path, ("time_s", "steering_deg"), text=("direction",), recorded=recorded)
+    table = read_table(path, ("time_s", "steering_deg"), ("direction",), recorded, any_clock)
     by_speed = "speed_mps" in table
     known = {*SPEED_COMMANDS, "direction"} if by_speed else COMMANDS
     for name in table:
