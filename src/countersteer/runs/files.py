@@ -46,9 +46,10 @@ def read_table(
 
     Columns named in `text` stay text. With `any_clock`, times may be far from 0.
 
-    A last line that was cut off, by a killed process, is left out with a logged warning: one with too few cells, or, if `TableWriter` `recorded` the file, one
-    that does not end. Raises `InputError` if a column is missing or appears twice; and, with the
-    line, for a wrong number of cells, a cell that is no number, or a falling time.
+    A last line that was cut off, by a killed process, is left out with a logged warning: one with
+    too few cells, or, if `TableWriter` `recorded` the file, one that does not end. Raises
+    `InputError` if a column is missing or appears twice; and, with the line, for a wrong number of
+    cells, a cell that is no number, or a falling time.
     """
     with reading(path):
         return _read_table(path, required, text, recorded, any_clock)

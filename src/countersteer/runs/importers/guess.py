@@ -19,7 +19,10 @@ from countersteer.runs.importers.units import SIGNALS, UNITS
 
 # Words of a column's name for each signal, the surest first, and words that speak against it.
 WORDS = {
-    "time": (r"time|stamp|^t$|^secs?$|^ms$|clock|elapsed|millis|micros", r"lap|timer|timeout"),
+    "time": (
+        r"time|stamp|^t$|^t[_ (]+[mun]?s|^secs?$|^ms$|clock|elapsed|millis|micros",
+        r"lap|timer|timeout",
+    ),
     "throttle": (r"throttle|^thr|^th$|gas|duty|accelerator|pwm_motor|esc", r"brake|temp|desc"),
     "speed": (
         r"(cmd|command|target|desired|ref|set).*(speed|vel|^v$)|^v$|drive.speed",
@@ -183,9 +186,7 @@ def _share(column: Column) -> Guess:
     if most <= 105:
         return Guess(column.name, {"unit": "%"}, "" if "%" in column.name else "1 or %?")
     span = 1024 if most <= 1100 else 2 ** int(np.ceil(np.log2(most)))
-    return Guess(
-        column.name, {"unit": "counts", "span": span}, f"full scale {span} is a guess"
-    )
+    return Guess(column.name, {"unit": "counts", "span": span}, f"full scale {span} is a guess")
 
 
 def _angle(column: Column) -> Guess:

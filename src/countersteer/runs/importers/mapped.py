@@ -191,7 +191,7 @@ class _Reader:
             unit = entry.unit_of(signal, place)
             factor = entry.sign * entry.scale * factor_of(unit, self.recipe.numbers)
             parts.append(factor * (column - unit.zero) / unit.span)
-        known = np.isfinite(parts)
+        known = ~np.isnan(parts)
         count = np.sum(known, axis=0)
         total = np.sum(np.where(known, parts, 0.0), axis=0)
         value: np.ndarray = np.where(count > 0, total / np.maximum(count, 1), math.nan)

@@ -166,10 +166,10 @@ def _types(log: Path, connection: Any) -> Types:
         raise InputError(f"{log}: {shown(kind)} is no type of messages")
     if len(told.data) > LONGEST_DEFINITION:
         raise InputError(f"{log}: the definition of {short(kind)} is too long")
+    found: dict[str, Any] = dict(get_typestore(Stores.EMPTY).fielddefs)  # times
     if told.format.name == "MSG":
-        return get_types_from_msg(told.data, kind)
+        return found | get_types_from_msg(told.data, kind)
     if told.format.name == "IDL":
-        found: dict[str, Any] = {}
         for text in re.split(r"={80}\n", told.data):
             head, _, rest = text.partition("\n")
             found |= get_types_from_idl(rest if head.startswith("IDL: ") else text) if text else {}
