@@ -210,6 +210,7 @@ def test_files_may_be_written_in_other_ways(tmp_path, text):
         (PLAIN + f"pole_pairs = {'9' * 400}", "a whole number of some 400 digits"),
         (PLAIN + "sensors.encoder.lag_s = -1", "sensors.encoder.lag_s"),
         (PLAIN + "[", "not valid TOML"),
+        (PLAIN + "gyro = []", "gyro must be an entry"),
     ],
 )
 def test_a_wrong_mapping_is_refused_with_its_key(tmp_path, mapping, says):

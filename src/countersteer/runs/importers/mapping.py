@@ -118,6 +118,8 @@ def recipe_of(tables: Mapping[str, Any], where: str) -> Recipe:
     for signal in SIGNALS:
         if signal in tables:
             given = tables[signal] if isinstance(tables[signal], list) else [tables[signal]]
+            if not 1 <= len(given) <= MOST_COLUMNS:
+                raise InputError(f"{where}: {signal} must be an entry, or up to {MOST_COLUMNS}")
             entries[signal] = tuple(
                 _entry(signal, entry, f"{where}: {signal}", numbers) for entry in given
             )
