@@ -1,6 +1,5 @@
 """Cars that are commanded in m/s: the speed controller, and logs of such cars."""
 
-import dataclasses
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from countersteer import cli
-from countersteer.car.car import Car, SpeedController
+from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
 from countersteer.errors import InputError
@@ -29,9 +28,10 @@ DT, SECONDS = 0.002, 5
 
 def controlled(**numbers: float) -> Car:
     """The library's car with a speed controller."""
-    part = {"gain": 1.0, "feed_forward": 0.2} | numbers
-    made = SpeedController(**{name: np.float64(value) for name, value in part.items()})
-    return dataclasses.replace(load_car("rx7"), speed_controller=made)
+    car = load_car("rx7")
+    for name, value in ({"gain": 1.0, "feed_forward": 0.22} | numbers).items():
+        car = changed(car, f"speed_controller.{name}", np.float64(value))
+    return car
 
 
 @jax.jit
