@@ -328,6 +328,8 @@ def test_a_guessed_mapping_imports_the_log_that_it_was_guessed_from(tmp_path, ca
         ("t,cmd_speed_mps,d", "{t},2,0", "speed", {"unit": "m/s"}),
         ("t,thr,yaw_rate", "{t},0.4,1.5", "gyro", {"unit": "rad/s"}),
         ("t,thr,yaw_rate", "{t},0.4,150", "gyro", {"unit": "deg/s"}),
+        ("t,thr,speed_FL,speed_FR", "{t},0.4,1,2", "wheel_speed", {"unit": "m/s"}),
+        ("s,ns,thr,v", "{t},5,0.4,1", "time", {"columns": ["s", "ns"], "unit": ["s", "ns"]}),
         ("t,thr,erpm", "{t},0.4,9000", "wheel_speed", {"unit": "erpm"}),
         ("t_us,thr,v", "{t}e6,0.4,1", "time", {"unit": "us"}),
         ("time,thr,v", "{t}e3,0.4,1", "time", {"unit": "ms"}),

@@ -20,7 +20,7 @@ from countersteer.runs.importers.units import SIGNALS, UNITS
 # Words of a column's name for each signal, the surest first, and words that speak against it.
 WORDS = {
     "time": (
-        r"time|stamp|^t$|^t[_ (]+[mun]?s|^secs?$|^ms$|clock|elapsed|millis|micros",
+        r"time|stamp|^t$|^t[_ (]+[mun]?s|^s$|^secs?$|^ms$|clock|elapsed|millis|micros",
         r"lap|timer|timeout",
     ),
     "throttle": (r"throttle|^thr|^th$|gas|duty|accelerator|pwm_motor|esc", r"brake|temp|desc"),
@@ -34,7 +34,10 @@ WORDS = {
         r"wheel.*(speed|vel)|encoder|erpm|rpm|odom|^speed|vehicle.*speed|^vel",
         r"cmd|command|target|desired|ref|count|ang|lat|gps|acc",
     ),
-    "gyro": (r"yaw.?rate|gyro.*z|w.?z$|ang.*vel.*z|omega|^r$|^gz$|gyro(?!.*[xy])", r"target|temp"),
+    "gyro": (
+        r"yaw.?rate|gyro.*z|w.?z$|ang.*vel.*z|omega|^r$|^gz$|^w\b|gyro(?!.*[xy])",
+        r"target|temp",
+    ),
     "accel_x": (r"acc.*x|^a_?x$", r"gyro"),
     "accel_y": (r"acc.*y|^a_?y$", r"gyro"),
     "battery": (r"batt|volt|vbat|rxbt|^vi$|^v_in", r"percent|temp|cell"),
@@ -72,6 +75,9 @@ UNIT_WORDS = {
 }
 FASTEST_TURN = 35.0  # rad/s; a faster yaw rate is in degrees
 STEEPEST = 0.8  # rad; a larger angle is in degrees, or it is no angle
+# A log with a column for each wheel, and one whose clock is in two columns.
+CORNER = re.compile(r"(fl|fr|rl|rr)\b|(front|rear).?(left|right)", re.IGNORECASE)
+NANOSECONDS = re.compile(r"n(ano)?s(ec\w*)?", re.IGNORECASE)
 MANY = 50  # turning rows that tell a sign
 
 
@@ -111,6 +117,8 @@ def guess_mapping(log: Path) -> tuple[str, list[str]]:
         if column is not None and not (signal == "speed" and "throttle" in guesses):
             guesses[signal] = GUESSERS[SIGNALS[signal].dimension](column)
             taken.add(column.name)
+            if signal in ("time", "wheel_speed"):
+                taken |= _with_others(guesses[signal], columns)
     for signal, doing in (("time", "time"), ("throttle", "a throttle or a commanded speed")):
         if signal not in guesses and not (signal == "throttle" and "speed" in guesses):
             raise InputError(
@@ -141,10 +149,23 @@ def _named(
         for column in columns:
             name = column.name.lower()
             fits = re.search(word, name) and not (against and re.search(against, name))
-            told = len(column.known) > 0 or signal in ("direction", "time")
+            told = column.most > 0 or signal in ("direction", "time")
             if fits and told and column.name not in taken:
                 return column
     return None
+
+
+def _with_others(guess: Guess, columns: list[Column]) -> set[str]:
+    """Add the columns that belong to the guess: other wheels, or the clock's nanoseconds."""
+    names = [column.name for column in columns]
+    if CORNER.search(guess.column):
+        alike = [n for n in names if CORNER.sub("", n) == CORNER.sub("", guess.column)]
+        if len(alike) > 1:
+            guess.entry["columns"] = alike
+    below = [n for n in names if NANOSECONDS.fullmatch(n)]
+    if re.fullmatch(r"s(ec\w*)?", guess.column, re.IGNORECASE) and len(below) == 1:
+        guess.entry.update(columns=[guess.column, *below], unit=["s", "ns"])
+    return set(guess.entry.get("columns", ()))  # type: ignore[call-overload]  # a list of names
 
 
 def _alternatives(words: str) -> list[str]:
@@ -167,7 +188,9 @@ def _time(column: Column) -> Guess:
     steps = column.steps[column.steps > 0]
     step = float(np.median(steps)) if len(steps) else 1.0
     likely = "s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns"
-    doubt = "" if told == likely else f"rows are {step:g} apart, which looks like {likely}"
+    doubt = (
+        f"rows are {step:g} apart, which looks like {likely}" if told not in (None, likely) else ""
+    )
     return Guess(column.name, {"unit": told or likely}, doubt)
 
 
@@ -295,11 +318,14 @@ def _text(log: Path, table: TextTable, guesses: dict[str, Guess], doubts: list[s
     if "erpm" in units:
         lines.append("pole_pairs = 2")
     for signal, guess in guesses.items():
-        pairs = {"column": guess.column, **guess.entry}
+        column = {} if "columns" in guess.entry else {"column": guess.column}
+        pairs = {**column, **guess.entry}
         inner = ", ".join(f"{key} = {json.dumps(value)}" for key, value in pairs.items())
         lines.append(f"{signal} = {{ {inner} }}")
     lines += [f"# doubt: {doubt}" for doubt in doubts]
     used = {guess.column for guess in guesses.values()}
+    for guess in guesses.values():
+        used |= set(guess.entry.get("columns", ()))  # type: ignore[call-overload]  # names
     rest = [name for name in table.names if name and name not in used]
     if rest:
         lines.append(f"# not used: {short(', '.join(rest))}")
