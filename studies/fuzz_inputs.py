@@ -29,7 +29,9 @@ from countersteer.experiments.open_turns import read_turns, series_of, stops
 from countersteer.judge_run import samples_of
 from countersteer.pilot import pilot_of_run
 from countersteer.runs.files import column_rows, command_rows, read_commands
+from countersteer.runs.importers.csv import import_csv
 from countersteer.runs.importers.dart import import_dart
+from countersteer.runs.importers.donkeycar import import_donkeycar
 from countersteer.runs.importers.eth import import_eth
 from countersteer.runs.run import Run, read_run
 from countersteer.text import toml_of
@@ -122,6 +124,17 @@ to_m = 3.0
 does = "drift"
 turn_deg = -90.0
 """
+MAPPING = """full_lock_deg = 25
+time = { column = "vicon time", unit = "s" }
+throttle = { column = "throttle", unit = "1" }
+steering = { column = "steering", unit = "1" }
+wheel_speed = { column = "vel encoder", unit = "m/s", within = [0, 20], held = true }
+gyro = { column = "W (IMU)", unit = "rad/s" }
+x = { column = "vicon x", unit = "m" }
+y = { column = "vicon y", unit = "m" }
+heading = { column = "vicon yaw", unit = "rad" }
+armed = { column = "safety_value", above = 0.5 }
+"""
 POPULATION = """description = "a few"
 [vary]
 "body.mass_kg" = { within = 0.1 }
@@ -157,6 +170,18 @@ def formats() -> dict[str, Format]:
         Format("turns", {"t.csv": turns()}, ("t.csv",), _turns),
         Format("dart", {"l.csv": dart()}, ("l.csv",), _import(import_dart, "l.csv")),
         Format("eth", {"l.npz": eth()}, ("l.npz",), _import(import_eth, "l.npz")),
+        Format(
+            "mapped",
+            {"l.csv": dart(), "m.toml": MAPPING.encode()},
+            ("l.csv", "m.toml"),
+            _import(lambda log, out: import_csv(log, out, log.with_name("m.toml")), "l.csv"),
+        ),
+        Format(
+            "tub",
+            tub(),
+            tuple(tub()),
+            _import(lambda log, out: import_donkeycar(log, out, None), "manifest.json"),
+        ),
         Format("policy", {"p.toml": policy()}, ("p.toml",), _driver),
         Format("plan", {"p.toml": PLAN.encode(), **steps}, ("p.toml", "steps.csv"), _driver),
         Format("population", {"s.toml": POPULATION.encode()}, ("s.toml",), _population),
@@ -276,6 +301,21 @@ def dart() -> bytes:
         "vicon yaw": (heading + np.pi) % (2 * np.pi) - np.pi,
     }  # fmt: skip
     return table(columns)
+
+
+def tub() -> dict[str, bytes]:
+    """A tub of Donkeycar."""
+    records = [
+        {"_index": i, "_timestamp_ms": 1700000000000 + 50 * i}
+        | {"user/angle": 0.1, "user/throttle": 0.3, "enc/speed": 0.1 * i}
+        for i in range(20)
+    ]
+    paths = {"paths": ["catalog_0.catalog"], "deleted_indexes": [3]}
+    lines: list[Any] = [["user/angle", "user/throttle"], ["float", "float"], {}, {}, paths]
+    return {
+        "manifest.json": "\n".join(map(json.dumps, lines)).encode(),
+        "catalog_0.catalog": "".join(json.dumps(one) + "\n" for one in records).encode(),
+    }
 
 
 def eth() -> bytes:

@@ -601,6 +601,7 @@ RIGHT = {
     "bad-yaml-alias-bomb": (["drive", "m.yaml"], 2, "aliases"),
     "bad-yaml-merge-bomb": (["drive", "m.yaml"], 2, "aliases"),
     "dart-blank-last-line": (["import", "dart", "log.csv", "good.csv", "--out", "OUT"], 0, ""),
+    "speed-commanded": (["replay", "commands.csv", "--out", "OUT"], 2, "column speed_mps"),
     "own-log-epoch": (["replay", ".", "--compare", "--out", "OUT"], 2, "Unix time"),
 }
 

@@ -33,7 +33,7 @@ from countersteer.kept_programs import kept
 from countersteer.link.link import LINKS, ONBOARD, Link
 from countersteer.random_streams import Stream
 from countersteer.reading.values import shown
-from countersteer.signals import Array, Command, Reading, Readings, Scalar
+from countersteer.signals import AnyCommand, Array, Command, Reading, Readings, Scalar, SpeedCommand
 
 PYTHON_PERIOD = 0.005  # s, default time between two decisions of a driver in plain Python
 
@@ -46,7 +46,7 @@ class PilotMemory(NamedTuple):
 
     estimate: Any  # the estimator's
     driver: Any
-    command: Command  # the last
+    command: AnyCommand  # the last
 
 
 @pytree
@@ -115,7 +115,7 @@ class Pilot:
         reals = [leaf for leaf in jax.tree.leaves(self.estimator) if _is_real(leaf)]
         return np.dtype(getattr(reals[0], "dtype", np.float64) if reals else np.float64)
 
-    def rerun(self, seed: int, readings: Readings, ticks: Array) -> Command:
+    def rerun(self, seed: int, readings: Readings, ticks: Array) -> AnyCommand:
         """The commands of its decisions at the ticks (n,), without a car.
 
         Leaves of `readings` have a leading axis of n. `seed` is the drive's. JAX must be able to
@@ -137,7 +137,7 @@ class Pilot:
 
     def act(
         self, memory: PilotMemory, readings: Readings, tick: Scalar
-    ) -> tuple[Command, PilotMemory]:
+    ) -> tuple[AnyCommand, PilotMemory]:
         """The command from this tick on, and the memory after it.
 
         A call from Python runs compiled code. Raises `InputError` if a driver in Python returns a
@@ -208,12 +208,13 @@ def _init(pilot: Pilot, root: jax.Array) -> PilotMemory:
     if pilot.traced:
         memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
     zero = dtype.type(0)
-    return PilotMemory(estimate, memory, Command(zero, zero))
+    first = getattr(pilot.driver, "command_type", Command)(zero, zero)
+    return PilotMemory(estimate, memory, first)
 
 
 def _act(
     pilot: Pilot, memory: PilotMemory, readings: Readings, tick: Scalar
-) -> tuple[Command, PilotMemory]:
+) -> tuple[AnyCommand, PilotMemory]:
     estimate, observation = pilot.observe(memory, readings, tick)
     command, own = pilot.driver.act(memory.driver, observation)
     after = PilotMemory(
@@ -230,8 +231,8 @@ _compiled_estimate = jax.jit(lambda estimator, memory: estimator.estimate(memory
 
 
 @jax.jit
-def _rerun(pilot: Pilot, root: jax.Array, readings: Readings, ticks: Array) -> Command:
-    def decide(memory: PilotMemory, now: tuple[Readings, Scalar]) -> tuple[PilotMemory, Command]:
+def _rerun(pilot: Pilot, root: jax.Array, readings: Readings, ticks: Array) -> AnyCommand:
+    def decide(memory: PilotMemory, now: tuple[Readings, Scalar]) -> tuple[PilotMemory, AnyCommand]:
         command, memory = pilot.act(memory, *now)
         return memory, command
 
@@ -290,8 +291,10 @@ def checked(driver: Any, answer: Any) -> tuple[Command, Any]:
     return Command(*map(float, command)), memory
 
 
-def bounded(command: Command) -> Command:
-    """The command within its limits: throttle in ±1, steering in ±90°."""
+def bounded(command: AnyCommand) -> AnyCommand:
+    """The command within its limits: throttle in ±1, steering in ±90°. A speed has no limit."""
+    if isinstance(command, SpeedCommand):
+        return command._replace(steering=jnp.clip(command.steering, *LOCKS))
     return Command(jnp.clip(command.throttle, -1.0, 1.0), jnp.clip(command.steering, *LOCKS))
 
 

@@ -17,13 +17,15 @@ from countersteer.car.files import car_tables, load_car
 from countersteer.course.course import Course
 from countersteer.course.files import course_tables
 from countersteer.drivers.registry import make_driver
+from countersteer.drivers.replay import SpeedReplay
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
 from countersteer.runs.files import read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
+from countersteer.runs.run import refuse_uncontrolled
 from countersteer.sensing.all_sensors import channels
 from countersteer.sensing.faults import SensorFault, fault_tables
-from countersteer.signals import Motion, Wheels, truth_columns
+from countersteer.signals import Command, Motion, Wheels, truth_columns
 from countersteer.simulator import PIECE, Record, Simulator
 from countersteer.task.judge import PERIOD, Outcome, Sample, Task, samples, summary
 from countersteer.world.floor import Floor, floor_tables
@@ -66,6 +68,8 @@ def prepare(
     course.check_laps(laps)
     nominal = load_car(car_name)
     made, tables = make_driver(driver, course, nominal, speed, laps, read_commands)
+    if isinstance(made, SpeedReplay):
+        refuse_uncontrolled(("speed",), car, driver)
     pilot = Pilot.of(made, course, nominal, estimate, link, dt)
     simulator = Simulator.of(
         course,
@@ -202,7 +206,10 @@ def drive(
     laps = int(about["laps"])
     task, pace = Task.of(course, laps), pace_of(simulator)
     score, outcome = task.init(), Outcome.DRIVING
-    with Recorder(folder, about, channels=channels(simulator.car), pace=pace) as recorder:
+    command = getattr(pilot.driver, "command_type", Command)
+    with Recorder(
+        folder, about, channels=channels(simulator.car), pace=pace, command=command
+    ) as recorder:
         with (
             Interrupt() as interrupt,
             contextlib.closing(simulator.run(pilot, longest)) as pieces,

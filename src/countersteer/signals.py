@@ -29,6 +29,16 @@ class Command(NamedTuple):
     steering: Scalar  # angle of the front wheels, rad, positive to the left
 
 
+class SpeedCommand(NamedTuple):
+    """The command of a driver to a car with a speed controller."""
+
+    speed: Scalar  # m/s, of the driven wheels' rims; negative is reverse
+    steering: Scalar  # as in `Command`
+
+
+AnyCommand: TypeAlias = Command | SpeedCommand
+
+
 class Motion(NamedTuple):
     """The continuous state of a car. SI units, radians, ISO 8855 axes."""
 

@@ -191,6 +191,19 @@ class Motor:
 
 
 @pytree
+class SpeedController:
+    """Sets the motor's duty for a commanded speed, as that of an F1TENTH car. Off (gain 0).
+
+    It acts on commands in m/s only. Throttles pass it by.
+    """
+
+    gain: Scalar = parameter(0.0, "s/m", 0, 20, "duty per speed error; 0: no speed controller")
+    feed_forward: Scalar = parameter(0.0, "s/m", 0, 10, "duty per commanded speed")
+    throttle_limit: Scalar = parameter(1.0, "1", 0.01, 1, "largest duty towards the speed")
+    brake_limit: Scalar = parameter(1.0, "1", 0, 1, "largest duty against the direction of travel")
+
+
+@pytree
 class Battery:
     """A pack. Its voltage sags with current, more so with wear, and falls as it discharges."""
 
@@ -385,6 +398,7 @@ class Car:
     tires: Tires = Tires()
     drivetrain: Drivetrain = Drivetrain()
     motor: Motor = Motor()
+    speed_controller: SpeedController = SpeedController()
     battery: Battery = Battery()
     servo: Servo = Servo()
     sensors: Sensors = Sensors()

@@ -32,6 +32,7 @@ EDGE = {
     "rad/s": ("_degps", math.pi / 180),
     "rad/s2": ("_degps2", math.pi / 180),
     "m/s": ("_mps", 1.0),
+    "s/m": ("_spm", 1.0),
     "m/s2": ("_mps2", 1.0),
     "N m": ("_nm", 1.0),
     "N m s": ("_nms", 1.0),

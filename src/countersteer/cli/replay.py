@@ -80,10 +80,13 @@ def replayed(options: argparse.Namespace, run: "Run | None", car: "Car", name: s
     from countersteer.pilot import Pilot
     from countersteer.recorded_drive import Drive, about_run
     from countersteer.runs.files import LONGEST, read_commands
+    from countersteer.runs.run import refuse_uncontrolled
     from countersteer.simulator import Simulator
     from countersteer.world.floor import floor_of_run
 
     commands = run.commands if run else read_commands(options.source)
+    where = f"{options.source}/commands.csv" if run else str(options.source)
+    refuse_uncontrolled(commands, car, where)
     pose, velocity = read_initial(options.initial)
     if run is not None and not options.initial:
         begin = run.about.get("start") or run.about.get("course", {}).get("start")

@@ -388,6 +388,8 @@ def _policy(
             steering = np.array([numbers["steering_deg"]])
         else:
             played = read(folder / checked_path(row["commands"], f"{where}: commands"))
+            if "speed" in played:
+                raise InputError(f"{where}: commands: a plan plays throttles, not speeds in m/s")
             times = np.asarray(played["time_s"]) - played["time_s"][0]
             throttle, steering = np.asarray(played["throttle"]), np.asarray(played["steering"])
     return Policies(

@@ -13,7 +13,7 @@ from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
 from countersteer.drivers.pursuit import pursuit
-from countersteer.drivers.replay import Replay
+from countersteer.drivers.replay import Replay, SpeedReplay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
 from countersteer.reading.values import short, shown
@@ -92,8 +92,9 @@ def driver_of_tables(
     raise InputError(f"{short(where)}: no driver of kind {shown(kind)} can be made from plain data")
 
 
-def replay(commands: Mapping[str, np.ndarray]) -> Replay:
-    """A driver that replays the columns `time_s`, `throttle` and `steering` (rad)."""
-    return Replay(
-        times=commands["time_s"], throttle=commands["throttle"], steering=commands["steering"]
-    )
+def replay(commands: Mapping[str, np.ndarray]) -> Replay | SpeedReplay:
+    """A driver that replays the columns of `runs.files.read_commands`."""
+    times, steering = commands["time_s"], commands["steering"]
+    if "speed" in commands:
+        return SpeedReplay(times=times, speed=commands["speed"], steering=steering)
+    return Replay(times=times, throttle=commands["throttle"], steering=steering)

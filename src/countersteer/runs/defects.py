@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 
 from countersteer.car.car import GRAVITY
 from countersteer.errors import InputError
-from countersteer.runs.files import Table
+from countersteer.runs.files import Table, drive_column
 from countersteer.runs.run import Run, refuse_long
 
 # Clocks
@@ -426,7 +426,8 @@ def stuck_encoder(run: Run, track: Track | None) -> Iterator[LogDefect]:
     gyro_time, gyro = readings(run, "gyro_radps")
     for first, last in held(time, speed, HELD):
         at, value = time[first : last + 1], float(speed[first])
-        throttle = asked(run, "throttle", at)
+        # A speed says where a throttle drives, and where none does.
+        throttle = np.clip(asked(run, drive_column(run.commands), at), -1, 1)
         idle = throttle == 0
         early, late = (np.mean(half) for half in np.array_split(throttle, 2))
         throttle_changes = abs(late - early) > 0.2 and min(early, late) < FULL
@@ -496,16 +497,17 @@ def refuse(run: Run) -> None:
     for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
         if table is not None:
             _refuse_table(f"{run.path}/{name}.csv", table)
-    commands = f"{run.path}/commands.csv"
+    commands, drive = f"{run.path}/commands.csv", drive_column(run.commands)
     _require_none(
-        commands, run.commands, ~np.isfinite(run.commands["throttle"]), "throttle is no number"
+        commands, run.commands, ~np.isfinite(run.commands[drive]), f"{drive} is no number"
     )
-    _require_none(
-        commands,
-        run.commands,
-        np.abs(run.commands["throttle"]) > 1,
-        "throttle is beyond 1: is it in percent?",
-    )
+    if drive == "throttle":
+        _require_none(
+            commands,
+            run.commands,
+            np.abs(run.commands["throttle"]) > 1,
+            "throttle is beyond 1: is it in percent?",
+        )
     _require_none(
         commands,
         run.commands,

@@ -18,7 +18,9 @@ from countersteer.writing import naming, write_whole
 log = logging.getLogger(__name__)
 
 COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
+SPEED_COMMANDS = ("time_s", "speed_mps", "steering_deg")  # of a car with a speed controller
 LARGEST_STEERING = 90.0  # degrees
+FASTEST = 100.0  # m/s, of a commanded speed
 LATEST = 1e6  # s, of a time; a clock of Unix time is beyond
 LONGEST = 3600.0  # s, of what is simulated on the commands of a log
 LARGEST = 1e20  # of a finite cell of a run; sums of squares of larger ones leave the floats
@@ -34,20 +36,28 @@ class Table(dict[str, np.ndarray]):
 
 
 def read_table(
-    path: Path, required: Iterable[str], text: Sequence[str] = (), recorded: bool = False
+    path: Path,
+    required: Iterable[str],
+    text: Sequence[str] = (),
+    recorded: bool = False,
+    any_clock: bool = False,
 ) -> Table:
     """Read a CSV file with a header as columns of numbers; empty cells are NaN.
 
-    Columns named in `text` stay text. A last line that was cut off, by a killed process, is left
-    out with a logged warning: one with too few cells, or, if `TableWriter` `recorded` the file, one
-    that does not end. Raises `InputError` if a column is missing or appears twice; and, with the
-    line, for a wrong number of cells, a cell that is no number, or a falling time.
+    Columns named in `text` stay text. With `any_clock`, times may be far from 0.
+
+    A last line that was cut off, by a killed process, is left out with a logged warning: one with
+    too few cells, or, if `TableWriter` `recorded` the file, one that does not end. Raises
+    `InputError` if a column is missing or appears twice; and, with the line, for a wrong number of
+    cells, a cell that is no number, or a falling time.
     """
     with reading(path):
-        return _read_table(path, required, text, recorded)
+        return _read_table(path, required, text, recorded, any_clock)
 
 
-def _read_table(path: Path, required: Iterable[str], text: Sequence[str], recorded: bool) -> Table:
+def _read_table(
+    path: Path, required: Iterable[str], text: Sequence[str], recorded: bool, any_clock: bool
+) -> Table:
     content = read_text(path)
     lines = content.splitlines()
     while lines and not lines[-1].strip():
@@ -87,11 +97,12 @@ def _read_table(path: Path, required: Iterable[str], text: Sequence[str], record
         time = table["time_s"]
         if not np.all(np.isfinite(time)):
             raise InputError(f"{path}, line {_first(~np.isfinite(time))}: time_s is not a number")
-        if np.any(np.abs(time) > LATEST):
-            line, first = _first(np.abs(time) > LATEST), time[np.argmax(np.abs(time) > LATEST)]
+        latest = LARGEST if any_clock else LATEST
+        if np.any(np.abs(time) > latest):
+            line, first = _first(np.abs(time) > latest), time[np.argmax(np.abs(time) > latest)]
             raise InputError(
-                f"{path}, line {line}: time_s must be within {LATEST:g} s of 0, not {first:.10g}: "
-                "if it is Unix time, subtract the time at which the log begins from all its tables"
+                f"{path}, line {line}: time_s must be within {latest:g} s of 0, not {first:.10g}: "
+                "if it is Unix time, 'countersteer import run' moves the clock of all tables to 0"
             )
         if np.any(np.diff(time) < 0):
             line = _first(np.diff(time) < 0) + 1
@@ -112,12 +123,14 @@ def _first(where: np.ndarray) -> int:
     return int(np.argmax(where)) + 2
 
 
-def read_measurements(path: Path, required: Iterable[str], recorded: bool = False) -> Table:
+def read_measurements(
+    path: Path, required: Iterable[str], recorded: bool = False, any_clock: bool = False
+) -> Table:
     """Read a table of a run. Raises `InputError` for a finite number beyond `LARGEST` too.
 
-    `recorded` is as in `read_table`.
+    `recorded` and `any_clock` are as in `read_table`.
     """
-    table = read_table(path, required, recorded=recorded)
+    table = read_table(path, required, (), recorded, any_clock)
     for name, column in table.items():
         beyond = np.isfinite(column) & (np.abs(column) > LARGEST)
         if np.any(beyond):
@@ -128,24 +141,40 @@ def read_measurements(path: Path, required: Iterable[str], recorded: bool = Fals
     return table
 
 
-def read_commands(path: Path, recorded: bool = False) -> Table:
+def read_commands(path: Path, recorded: bool = False, any_clock: bool = False) -> Table:
     """Read a `commands.csv` as `time_s`, `throttle` (negative in reverse) and `steering` (rad).
 
-    `recorded` is as in `read_table`.
+    If it commands speeds, `speed` (m/s, negative in reverse) stands in place of `throttle`. A
+    direction is optional there. `recorded` and `any_clock` are as in `read_table`.
     """
-    table = read_table(path, COMMANDS, text=("direction",), recorded=recorded)
+    table = read_table(path, ("time_s", "steering_deg"), ("direction",), recorded, any_clock)
+    by_speed = "speed_mps" in table
+    known = {*SPEED_COMMANDS, "direction"} if by_speed else COMMANDS
     for name in table:
-        if name not in COMMANDS:
-            raise InputError(f"{path}: unknown column {short(name)}; known: {', '.join(COMMANDS)}")
+        if by_speed and name == "throttle":
+            raise InputError(f"{path}: columns throttle and speed_mps: give one of the two")
+        if name not in known:
+            words = ", ".join((*COMMANDS, "speed_mps"))
+            raise InputError(f"{path}: unknown column {short(name)}; known: {words}")
+    for name in SPEED_COMMANDS if by_speed else COMMANDS:
+        if name not in table:
+            raise InputError(f"{path}: column {name} is missing")
     if not len(table):
         raise InputError(f"{path}: holds no command")
-    throttle, steering = table["throttle"], table["steering_deg"]
+    asked, steering = table["speed_mps" if by_speed else "throttle"], table["steering_deg"]
+    direction = table.get("direction", np.full(len(table), "forward"))
+    reverse = direction == "reverse"
     for wrong, message in (
+        (~np.isin(direction, ("forward", "reverse")), "direction must be forward or reverse"),
         (
-            ~np.isin(table["direction"], ("forward", "reverse")),
-            "direction must be forward or reverse",
+            ~((asked >= 0) & (asked <= 1)) & (not by_speed),
+            "throttle must be in [0, 1]; a speed in m/s goes into a column speed_mps",
         ),
-        (~((throttle >= 0) & (throttle <= 1)), "throttle must be in [0, 1]"),
+        (
+            ~(np.abs(asked) <= FASTEST) & by_speed,
+            f"speed_mps must be in [-{FASTEST:g}, {FASTEST:g}]",
+        ),
+        ((asked < 0) & reverse, "speed_mps is negative and direction is reverse: give one of them"),
         (
             ~(np.abs(steering) <= LARGEST_STEERING),
             f"steering_deg must be in [-{LARGEST_STEERING:g}, {LARGEST_STEERING:g}]",
@@ -154,8 +183,18 @@ def read_commands(path: Path, recorded: bool = False) -> Table:
     ):
         if np.any(wrong):
             raise InputError(f"{path}, line {_first(wrong)}: {message}")
-    sign = np.where(table["direction"] == "reverse", -1.0, 1.0)
-    return Table(time_s=table["time_s"], throttle=sign * throttle, steering=np.radians(steering))
+    column = {drive_column(table): np.where(reverse, -1.0, 1.0) * asked}
+    return Table(time_s=table["time_s"], **column, steering=np.radians(steering))
+
+
+def drive_column(commands: Iterable[str]) -> str:
+    """The column that commands the motor: `speed` of a car commanded in m/s, else `throttle`."""
+    return "speed" if {"speed", "speed_mps"} & set(commands) else "throttle"
+
+
+def speed_rows(time: np.ndarray, speed: np.ndarray, steering: np.ndarray) -> list[list[str]]:
+    """Rows of a `commands.csv` with speeds (m/s); steering in rad."""
+    return column_rows((time, speed, np.degrees(np.asarray(steering, float))))
 
 
 def command_rows(time: np.ndarray, throttle: np.ndarray, steering: np.ndarray) -> list[list[str]]:

@@ -13,9 +13,16 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from countersteer.errors import InputError
-from countersteer.runs.files import COMMANDS, TableWriter, column_rows, command_rows
+from countersteer.runs.files import (
+    COMMANDS,
+    SPEED_COMMANDS,
+    TableWriter,
+    column_rows,
+    command_rows,
+    speed_rows,
+)
 from countersteer.runs.mcap import McapWriter
-from countersteer.signals import TRUTH, Command, Readings, flat, pairs
+from countersteer.signals import TRUTH, AnyCommand, Command, Readings, SpeedCommand, flat, pairs
 from countersteer.text import toml_of
 from countersteer.writing import (
     BusyError,
@@ -48,7 +55,7 @@ class Frames(NamedTuple):
 
     tick: np.ndarray
     readings: Readings  # last reports of the sensors
-    command: Command  # of the car from this instant on
+    command: AnyCommand  # of the car from this instant on
     fresh: np.ndarray  # True for a new command
     truth: tuple[np.ndarray, ...] | None = None  # values of `TRUTH`; None: unknown
 
@@ -169,11 +176,12 @@ class Recorder:
         headers: Mapping[str, Sequence[str]] | None = None,
         channels: Readings | None = None,
         pace: Pace | None = None,
+        command: type[AnyCommand] = Command,
     ) -> None:
         """Write `run.toml` and the `headers` of the tables, by name.
 
-        Frames need the `channels` of the car's sensors and the `pace`. Their headers follow from
-        the channels.
+        Frames need the `channels` of the car's sensors, the `pace`, and the type of `command`.
+        Their headers follow from them.
         """
         self.folder = folder
         self._channels, self._pace = channels, pace
@@ -181,8 +189,11 @@ class Recorder:
         if channels is not None:
             told = [column for channel in flat(channels) for column in channel.columns]
             truth = ("time_s", *(channel.name for channel in TRUTH))
-            headers = {"commands": COMMANDS, "telemetry": ("time_s", *told), "truth": truth}
+            commands = SPEED_COMMANDS if command is SpeedCommand else COMMANDS
+            headers = {"commands": commands, "telemetry": ("time_s", *told), "truth": truth}
         assert headers is not None
+        by_speed = "speed_mps" in headers.get("commands", ())
+        self._command_rows = speed_rows if by_speed else command_rows
         text = toml_of(about)
         write_whole(folder / "run.toml", text)
         self._tables = {
@@ -231,11 +242,14 @@ class Recorder:
     def write(self, tables: Mapping[str, Sequence[np.ndarray]]) -> None:
         """Append a piece: columns by table, in the order of its header.
 
-        `commands` is time, throttle (negative in reverse) and steering (rad); NaN is an empty cell.
+        `commands` is time, throttle (negative in reverse) or speed (m/s), and steering (rad). NaN
+        is an empty cell.
         """
         cells: dict[str, list[list[str]]] = {name: [] for name in self._tables}
         for name, columns in tables.items():
-            cells[name] = command_rows(*columns) if name == "commands" else column_rows(columns)
+            cells[name] = (
+                self._command_rows(*columns) if name == "commands" else column_rows(columns)
+            )
         for name, table in self._tables.items():
             table.write(cells[name])
         self._mcap.write(cells)

@@ -42,7 +42,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import changed, declarations
 from countersteer.errors import InputError
 from countersteer.runs import defects
-from countersteer.runs.files import Table
+from countersteer.runs.files import Table, drive_column
 from countersteer.runs.run import Run
 from countersteer.sensing import error_models
 from countersteer.signals import Array, Command, Scalar, Wheels
@@ -284,6 +284,8 @@ def take(run: Run, source: str) -> tuple[Step, list[str]]:
 
 def _motor_commands(run: Run) -> Table:
     """The commands with the throttle at the motor: 0 while the dead-man switch is open."""
+    if drive_column(run.commands) == "speed":
+        raise InputError(f"{run.path}: is commanded in m/s: steps of throttle are needed here")
     time = run.commands["time_s"]
     at, armed = defects.readings(run, "armed")
     throttle = defects.asked(run, "throttle", time)

@@ -43,6 +43,7 @@ LOGS = {  # a log: the parameters that it determines
         "drivetrain.drag_viscous",
     ),
     "steps of throttle in reverse, each from rest until the speed is steady": ("motor.reverse",),
+    "steps of commanded speed up and down, from rest and while rolling": ("speed_controller.*",),
     "slow circles at full lock to both sides": ("servo.limit_left", "servo.limit_right"),
     "slow circles at a quarter and at half lock to both sides": (
         "servo.gain_left",

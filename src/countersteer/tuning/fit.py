@@ -33,7 +33,7 @@ from countersteer.car.parameter import Declaration, changed, declarations
 from countersteer.errors import InputError
 from countersteer.runs.defects import LogDefect
 from countersteer.runs.run import Run
-from countersteer.signals import Array
+from countersteer.signals import Array, SpeedCommand
 from countersteer.tuning import shooting
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import QUANTITIES
@@ -95,9 +95,11 @@ STEERING = (
 )
 HANDLING = ("body.yaw_inertia", "body.front_roll_share")
 PARAMETERS = (*SPEEDS, *STEERING, *HANDLING, *TIRES)
+CONTROLLER = ("speed_controller.gain", "speed_controller.feed_forward")
+OF_CAR = (*PARAMETERS, *CONTROLLER)  # `CONTROLLER` is fitted to logs commanded in m/s only
 CHARGE = "battery.charge"  # belongs to a log, not to a car
 FULL = 1.0  # prior charge of a log that does not state it
-TABLE = (*PARAMETERS, CHARGE)
+TABLE = (*OF_CAR, CHARGE)
 WIDTHS = {"body.yaw_inertia": 0.3}  # prior standard deviations of logarithms
 ABSOLUTE = {  # prior standard deviations in SI units, of parameters that may be near zero
     CHARGE: 0.5,
@@ -108,6 +110,8 @@ ABSOLUTE = {  # prior standard deviations in SI units, of parameters that may be
     "motor.delay": 0.03,
     "motor.rotor_inertia": 1e-6,
     "drivetrain.drag_viscous": 1e-4,
+    "speed_controller.gain": 0.5,
+    "speed_controller.feed_forward": 0.05,
     "servo.trim": math.radians(2),
     "servo.lag": 0.05,
     "servo.delay": 0.03,
@@ -127,7 +131,7 @@ class Stage(NamedTuple):
 
 def straight(shots: Shots) -> np.ndarray:
     """True for windows whose steering stays below `STRAIGHT`: (windows,)."""
-    return np.max(np.abs(shots.steering), axis=1) < STRAIGHT
+    return np.max(np.abs(shots.commands.steering), axis=1) < STRAIGHT
 
 
 def slides(shots: Shots) -> np.ndarray:
@@ -360,7 +364,7 @@ class Problem:
         charges = np.full(logs, FULL) if charge is None else charge[:logs].copy()
         stated = np.isfinite(self.shots.charge)
         charges[self.shots.run[stated]] = self.shots.charge[stated]
-        of_car = np.array([[value_of(car, path) for path in PARAMETERS] for car in cars.values()])
+        of_car = np.array([[value_of(car, path) for path in OF_CAR] for car in cars.values()])
         return np.column_stack([of_car[self.surface], charges])
 
     def moves(self, parameter: Parameter) -> np.ndarray:
@@ -428,7 +432,7 @@ class Problem:
 
     @property
     def base(self) -> Car:
-        """A car with the values that are not fitted. Surfaces differ in `PARAMETERS` alone."""
+        """A car with the values that are not fitted. Surfaces differ in `OF_CAR` alone."""
         return next(iter(self.cars.values()))
 
     def solve(self, u: Array, passes: int) -> Solved:
@@ -480,8 +484,8 @@ class Problem:
 
 
 def with_values(car: Car, values: Array) -> Car:
-    """The car with all `PARAMETERS` replaced, in their order."""
-    for path, value in zip(PARAMETERS, values, strict=True):
+    """The car with all of `OF_CAR` replaced, in their order."""
+    for path, value in zip(OF_CAR, values, strict=True):
         car = changed(car, path, value)
     return car
 
@@ -549,6 +553,8 @@ def fit(
     for name in ORDER if what == "all" else (what,):
         stage = STAGES[name]
         free = stage.parameters
+        if isinstance(shots.commands, SpeedCommand) and set(free) & set(SPEEDS):
+            free = (*free, *CONTROLLER)
         if not (single_log and set(free) & set(SPEEDS)):
             free = (*free, CHARGE)
         chosen = stage.chooses(shots)

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from countersteer.car.car import Car
+from countersteer.errors import InputError
 from countersteer.runs.run import Run
-from countersteer.signals import Array, Command, Motion, Scalar, Wheels
+from countersteer.signals import AnyCommand, Array, Motion, Scalar, SpeedCommand, Wheels
 from countersteer.tuning import windows
 from countersteer.tuning.windows import (
     QUANTITIES,
@@ -25,7 +26,9 @@ from countersteer.tuning.windows import (
     quantities_of,
     radii,
     read_measured,
+    rims_at,
     rolling,
+    spins,
 )
 from countersteer.world import plant
 from countersteer.world.chassis import Vector
@@ -44,13 +47,20 @@ class Shots(NamedTuple):
     wheel_speed: Array  # mean rim speed; NaN: wheels roll
     rims: Wheels  # rim speeds; NaN: not known for each wheel
     charge: Array  # of the battery; NaN: not stated by the log
-    throttle: Array  # command: (windows, ticks from `BEFORE` on)
-    steering: Array
+    commands: AnyCommand  # (windows, ticks from `BEFORE` on)
+    rims_before: Array  # measured rim speed in the ticks of `BEFORE`, for a speed controller
     measured: Array  # (windows, quantities, samples after the start); NaN: not known
 
 
 def joined(parts: Sequence[Shots]) -> Shots:
-    """The windows of all parts in one `Shots`."""
+    """The windows of all parts in one `Shots`.
+
+    Raises `InputError` if some logs are commanded by throttle and some by speed.
+    """
+    if len({type(part.commands) for part in parts}) > 1:
+        raise InputError(
+            "some logs are commanded by throttle and some in m/s (speed_mps): fit them apart"
+        )
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
@@ -93,7 +103,10 @@ def take(
         else Wheels(*[nothing] * 4)
     )
     before = round(BEFORE / dt)
-    throttle, steering = asked(run.commands, starts[:, None] + np.arange(-before, ticks + 1), dt)
+    commands = asked(run.commands, starts[:, None] + np.arange(-before, ticks + 1), dt)
+    rims_before = np.zeros((len(starts), 0))
+    if isinstance(commands, SpeedCommand):
+        rims_before = rims_at(measured, time[:, None] + dt * np.arange(-before, 0))
     shots = Shots(
         np.full(len(starts), number),
         np.full(len(starts), surface),
@@ -102,8 +115,8 @@ def take(
         mean,
         rims,
         np.full(len(starts), float(run.about.get("battery_charge", math.nan))),
-        throttle,
-        steering,
+        commands,
+        rims_before,
         np.stack(seen, axis=1),
     )
     known = np.isfinite(vx + vy + yaw_rate)
@@ -117,8 +130,10 @@ def predict(car: Car, shot: Shots, dt: float) -> Array:
     samples = shot.measured.shape[-1]
     every = round(SAMPLE / dt)
     before = round(BEFORE / dt)
-    commands = plant.as_it_arrives(car, Command(shot.throttle, shot.steering), dt)
-    angle, duty = plant.settled(car, jax.tree.map(lambda line: line[:before], commands), dt)
+    commands = plant.as_it_arrives(car, shot.commands, dt)
+    angle, duty = plant.settled(
+        car, jax.tree.map(lambda line: line[:before], commands), spins(car, shot.rims_before), dt
+    )
     motion = _start(car, shot, angle, duty)
     ahead = jax.tree.map(lambda line: line[before : before + samples * every], commands)
     _, seen = plant.rollout(

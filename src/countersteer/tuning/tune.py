@@ -12,6 +12,7 @@ from countersteer.car.files import car_text, library, load_car
 from countersteer.car.parameter import EDGE, changed
 from countersteer.errors import InputError
 from countersteer.runs.defects import LogDefect, find_defects, refuse, repair
+from countersteer.runs.files import drive_column
 from countersteer.runs.run import Run
 from countersteer.text import toml_of
 from countersteer.tuning import fit, shooting
@@ -243,7 +244,7 @@ def series(cars: dict[str, Car], parts: Sequence[tuple[str, Logs]]) -> list[dict
                     ],
                     "commands": {
                         "time": run.commands["time_s"],
-                        "throttle": run.commands["throttle"],
+                        drive_column(run.commands): run.commands[drive_column(run.commands)],
                         "steering_deg": np.degrees(run.commands["steering"]),
                     },
                 },

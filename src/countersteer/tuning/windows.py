@@ -17,10 +17,10 @@ from scipy.signal import savgol_filter
 from countersteer.car.car import Car
 from countersteer.errors import InputError
 from countersteer.runs.defects import stretches
-from countersteer.runs.files import Table
-from countersteer.runs.run import Run, refuse_long
-from countersteer.signals import Command, Motion, Scalar, Wheels
-from countersteer.world import motor, planar, servo
+from countersteer.runs.files import Table, drive_column
+from countersteer.runs.run import Run, refuse_long, refuse_uncontrolled
+from countersteer.signals import AnyCommand, Command, Motion, Scalar, SpeedCommand, Wheels
+from countersteer.world import planar, servo, speed_controller
 from countersteer.world.chassis import Vector, dot
 from countersteer.world.state import State
 
@@ -102,9 +102,11 @@ class Reference(NamedTuple):
 def read_measured(run: Run, car: Car) -> Measured:
     """Body velocities, wheel speeds and sensor readings of a run.
 
-    Raises `InputError` if the run is too long, or its poses are too close in time.
+    Raises `InputError` if the run is too long, if its poses are too close in time, or if it is
+    commanded in m/s and the car has no speed controller.
     """
     refuse_long(run)
+    refuse_uncontrolled(run.commands, car, f"{run.path}/commands.csv")
     vx = vy = yaw_rate = wheels = None
     truth = run.truth
     if truth is not None and len(truth):
@@ -235,8 +237,8 @@ def window_starts(
     first, last = float(times[0]), float(times[-1])
     regular = np.arange(math.ceil(first / EVERY) * EVERY, last + EARLY, EVERY)
     regular = regular[speed_at(measured, regular, False) >= SLOWEST]
-    throttle = commands["throttle"]
-    onsets = times[(np.concatenate([[0.0], throttle[:-1]]) == 0) & (throttle > 0)]
+    drive = commands[drive_column(commands)]
+    onsets = times[(np.concatenate([[0.0], drive[:-1]]) == 0) & (drive > 0)]
     onsets = onsets[speed_at(measured, onsets, True) < SLOWEST]
     moving = np.rint(regular / dt).astype(int)
     resting = np.ceil(onsets / dt - EARLY).astype(int)
@@ -278,8 +280,10 @@ def states_at(
     They differ as their hubs' speeds do. Without an encoder they roll.
     """
     time = starts * dt
-    throttle, steering = asked(run.commands, np.arange(int(starts.max()) + 1), dt)
-    angle, duty = (trace[starts] for trace in actuators(car, throttle, steering, dt))
+    ticks = np.arange(int(starts.max()) + 1)
+    commands = asked(run.commands, ticks, dt)
+    rims = rims_at(measured, ticks * dt) if isinstance(commands, SpeedCommand) else None
+    angle, duty = (trace[starts] for trace in actuators(car, commands, rims, dt))
     zero = np.zeros(len(time))
     vx, vy, yaw_rate, ax, ay = body_at(measured, time, resting)
     wheels = wheels_at(car, measured, Vector(vx, vy, yaw_rate), angle, time, resting)
@@ -288,10 +292,19 @@ def states_at(
     slots = planar.delay_slots(car, dt)
     # A window's count starts at 0, so its slot s holds the command of the tick s - slots.
     before = starts[:, None] + np.arange(-slots, 0)
-    throttle_line, steering_line = (
-        np.where(before >= 0, line[np.maximum(before, 0)], 0.0) for line in (throttle, steering)
-    )
-    return State(motion, throttle_line, steering_line, *[zero] * 5)
+    lines = (np.where(before >= 0, line[np.maximum(before, 0)], 0.0) for line in commands)
+    return State(motion, *lines, *[zero] * 5)
+
+
+def rims_at(measured: Measured, time: np.ndarray) -> np.ndarray:
+    """The measured mean rim speed at any times (m/s), for a speed controller; 0 if unknown."""
+    reference = find_references(measured).get("wheel_speed_mps")
+    if reference is None:
+        return np.zeros_like(time)
+    known = np.isfinite(reference.signal.value)
+    signal = Signal(*(part[known] for part in reference.signal))
+    lag = 0.0 if reference.timing is None else reference.timing.lag
+    return np.interp(time + lag, *signal) if np.any(known) else np.zeros_like(time)
 
 
 def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -353,56 +366,71 @@ def rolling(car: Car, velocity: Vector, steering: Scalar, mean: Scalar) -> tuple
     return tuple(hub + slip for hub in hubs)
 
 
-def asked(commands: Table, ticks: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """The commanded throttle and steering (rad) in these ticks: held; 0 before the first."""
+def asked(commands: Table, ticks: np.ndarray, dt: float) -> AnyCommand:
+    """The commands in these ticks: held; 0 before the first."""
     last = np.searchsorted(commands["time_s"], ticks * dt + EARLY, side="right") - 1
     held = np.maximum(last, 0)
-    return (
-        np.where(last >= 0, commands["throttle"][held], 0.0),
+    drive = drive_column(commands)
+    return (SpeedCommand if drive == "speed" else Command)(
+        np.where(last >= 0, commands[drive][held], 0.0),
         np.where(last >= 0, commands["steering"][held], 0.0),
     )
 
 
 def actuators(
-    car: Car, throttle: np.ndarray, steering: np.ndarray, dt: float
+    car: Car, commands: AnyCommand, rims: np.ndarray | None, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Steering angle (rad) and duty at the start of each tick, for the commands of all ticks.
 
-    They do not depend on the car's motion. The laws and delays are those of `planar.step`.
+    The laws and delays are those of `planar.step`. Only a speed controller depends on the motion:
+    it measures `rims`, the rim speeds (m/s).
     """
     state = planar.initial_state(car, dt)
     # In pieces: one call for a whole log would be compiled for its length, and it would be slow.
-    missing = -len(throttle) % PIECE
-    padded = [np.pad(line, (0, missing), mode="edge") for line in (throttle, steering)]
+    ticks = len(commands.steering)
+    padded = jax.tree.map(
+        lambda line: np.pad(line, (0, -ticks % PIECE), mode="edge"), (commands, rims)
+    )
     traces = []
-    for begin in range(0, len(padded[0]), PIECE):
+    for begin in range(0, ticks, PIECE):
         count = np.arange(begin, begin + PIECE, dtype=np.int32)
-        piece = (line[begin : begin + PIECE] for line in padded)
+        piece = jax.tree.map(lambda line, at=begin: line[at : at + PIECE], padded)
         state, trace = _actuators(car, state, count, *piece, dt)
         traces.append(np.asarray(trace))
-    angle, duty = np.concatenate(traces, axis=1)[:, : len(throttle)]
+    angle, duty = np.concatenate(traces, axis=1)[:, :ticks]
     return angle, duty
 
 
 @partial(jax.jit, static_argnames="dt")
 def _actuators(
-    car: Car, state: State, counts: jax.Array, throttle: jax.Array, steering: jax.Array, dt: float
+    car: Car,
+    state: State,
+    counts: jax.Array,
+    commands: AnyCommand,
+    rims: jax.Array | None,
+    dt: float,
 ) -> tuple[State, tuple[jax.Array, jax.Array]]:
     """The state after these ticks, and steering angle and duty at the start of each."""
     no_walls = jnp.full((1, 4), jnp.nan)
 
-    def tick(state: State, now: tuple[jax.Array, Command]) -> tuple[State, Any]:
-        count, command = now
+    def tick(state: State, now: tuple[Any, ...]) -> tuple[State, Any]:
+        count, command, rim = now
         begin = (state.motion.steering, state.motion.duty)
         work = planar.Tick(car, no_walls, command, command, count, dt)
         state, work = planar.delay(state, work)
+        wheels = state.motion.wheels if rim is None else spins(car, rim)
         goal = Command(
-            motor.duty(car.motor, work.asked.throttle),
+            speed_controller.goal_duty(car, work.asked, wheels),
             servo.target(car.servo, work.asked.steering),
         )
         return state._replace(motion=planar.follow(car, state.motion, goal, dt)), begin
 
-    return jax.lax.scan(tick, state, (counts, Command(throttle, steering)))
+    return jax.lax.scan(tick, state, (counts, commands, rims))
+
+
+def spins(car: Car, rim: Scalar) -> Wheels:
+    """Spins of wheels that all have the rim speed `rim`."""
+    return Wheels(*(rim / radius for radius in radii(car)))
 
 
 def simulate(
@@ -421,8 +449,8 @@ def simulate(
         pieces = [np.stack([np.asarray(q) for q in quantities_of(car, state.motion)])[:, :, None]]
         for piece in range(0, ticks, PIECE):
             count = np.arange(piece, piece + PIECE, dtype=np.int32)
-            throttle, steering = asked(commands, starts[rows][None, :] + count[:, None], dt)
-            state, seen = _advance(car, state, count, throttle, steering, dt)
+            now = asked(commands, starts[rows][None, :] + count[:, None], dt)
+            state, seen = _advance(car, state, count, now, dt)
             pieces.append(np.stack([np.asarray(q).T for q in seen]))
         whole = np.concatenate(pieces, axis=2)
         chunks.append(whole[:, : len(chosen), : ticks + 1])
@@ -431,18 +459,18 @@ def simulate(
 
 @partial(jax.jit, static_argnames="dt")
 def _advance(
-    car: Car, states: State, counts: jax.Array, throttle: jax.Array, steering: jax.Array, dt: float
+    car: Car, states: State, counts: jax.Array, commands: AnyCommand, dt: float
 ) -> tuple[State, tuple[jax.Array, ...]]:
-    """The states after some ticks of all windows; throttle and steering are (ticks, windows)."""
+    """The states after some ticks of all windows; commands are (ticks, windows)."""
     no_walls = jnp.full((1, 4), jnp.nan)
 
-    def tick(states: State, now: tuple[jax.Array, Command]) -> tuple[State, Any]:
+    def tick(states: State, now: tuple[jax.Array, AnyCommand]) -> tuple[State, Any]:
         count, command = now
         step = jax.vmap(planar.step, in_axes=(None, None, 0, 0, None, None))
         states = step(car, no_walls, states, command, count, dt)
         return states, quantities_of(car, states.motion)
 
-    return jax.lax.scan(tick, states, (counts, Command(throttle, steering)))
+    return jax.lax.scan(tick, states, (counts, commands))
 
 
 def quantities_of(car: Car, motion: Motion) -> tuple[Scalar, ...]:

@@ -12,6 +12,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from countersteer.car.car import wheel_positions
 from countersteer.errors import InputError
+from countersteer.runs.files import drive_column
 from countersteer.runs.run import Run, drawn_car
 from countersteer.viewing import picture
 from countersteer.viewing.style import INK, LINE, PAPER, SOFT
@@ -113,8 +114,11 @@ class Animation:
         if "yaw_rate_radps" in truth:
             turning = np.degrees(truth["yaw_rate_radps"])
             strips.append(Strip("Yaw rate", "{:.0f}°/s", self._time, turning, SOFT))
-        throttle = 100 * asked["throttle"]
-        strips.append(Strip("Throttle", "{:.0f} %", asked["time_s"], throttle, SOFT))
+        if drive_column(asked) == "speed":
+            name, unit, drive = "Commanded speed", "{:.1f} m/s", asked["speed"]
+        else:
+            name, unit, drive = "Throttle", "{:.0f} %", 100 * asked["throttle"]
+        strips.append(Strip(name, unit, asked["time_s"], drive, SOFT))
         self._strips = strips
         self._trail = self._make_trail(truth, slip)
         self._place()

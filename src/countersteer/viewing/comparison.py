@@ -56,7 +56,7 @@ def draw_comparison(series: Mapping[str, Any], path: Path) -> None:
         if name == "commands":
             commands = series["commands"]
             steering = np.degrees(commands["steering"])
-            draw_commands(axes, commands["time_s"], commands["throttle"], steering)
+            draw_commands(axes, commands, steering)
             _write_caption(figure, bottom + pitch, "Commands", "")
             continue
         signal = series["measured"][name]

@@ -377,7 +377,9 @@ def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> No
         _Strip("Sideslip", "°", view["sideslip_deg"], "#c97a10"),
         _Strip("Yaw rate", "°/s", view["yaw_rate_degps"], SOFT),
         _Strip("Steering", "°", view["steering_deg"], SOFT, view["steering_command_deg"]),
-        _Strip("Throttle", "%", [100 * part for part in view["throttle"]], SOFT),
+        _Strip("Throttle", "%", [100 * part for part in view["throttle"]], SOFT)
+        if "throttle" in view
+        else _Strip("Commanded speed", "m/s", view["commanded_speed_mps"], SOFT),
     )
     left, bottom, width, height = place
     pitch = height / len(strips)

@@ -23,6 +23,7 @@ _DECIMALS = {
     "steering_deg": 2,
     "steering_command_deg": 2,
     "throttle": 3,
+    "commanded_speed_mps": 3,
 }
 _DECIMALS_OF_OTHERS = 4
 # Forces are drawn as parts of the friction limit, so their digits follow its size: a newton for a

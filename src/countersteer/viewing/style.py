@@ -1,6 +1,6 @@
 """The look of pictures: colours, figures, and parts that several pictures share."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -79,14 +79,19 @@ def draw_windows(
 
 
 def draw_commands(
-    axes: "Axes", time: Numbers, throttle: Numbers, steering: Numbers, size: float = LABEL
+    axes: "Axes", commands: Mapping[str, Numbers], steering: Numbers, size: float = LABEL
 ) -> None:
-    """Draw throttle (-1 to 1) as % on the left scale, and steering (°) on the right one."""
-    percent = 100 * throttle
-    axes.step(time, percent, where="post", color=INK, linewidth=1.3)
-    most = max(100.0, float(np.nanmax(np.abs(percent), initial=0.0)))
-    axes.set_ylim((-1.06 if np.any(throttle < 0) else -0.06) * most, 1.06 * most)
-    axes.set_ylabel("throttle, %", color=INK, size=size)
+    """Draw the columns of `read_commands`: the drive on the left scale, steering (°) on the right.
+
+    The drive is a throttle, as %, or a speed.
+    """
+    time, drive, least, label = commands["time_s"], commands.get("speed"), 1.0, "speed, m/s"
+    if drive is None:
+        drive, least, label = 100 * commands["throttle"], 100.0, "throttle, %"
+    axes.step(time, drive, where="post", color=INK, linewidth=1.3)
+    most = max(least, float(np.nanmax(np.abs(drive), initial=0.0)))
+    axes.set_ylim((-1.06 if np.any(drive < 0) else -0.06) * most, 1.06 * most)
+    axes.set_ylabel(label, color=INK, size=size)
     right = axes.twinx()
     right.step(time, steering, where="post", color=STEERED, linewidth=1.3)
     most = max(10.0, float(np.nanmax(np.abs(steering), initial=0.0)))

@@ -517,10 +517,8 @@ def _draw(run: Mapping[str, Any], begin: float, end: float) -> bytes:
         axes.tick_params(labelbottom=quantity is None)
         if quantity is None:
             commands = run["commands"]
-            time, throttle, steering = (
-                _array(commands[name]) for name in ("time", "throttle", "steering_deg")
-            )
-            draw_commands(axes, time, throttle, steering, 8.5)
+            lines = {name: _array(values) for name, values in commands.items()}
+            draw_commands(axes, {**lines, "time_s": lines["time"]}, lines["steering_deg"], 8.5)
             title = "commands"
         else:
             time, measured = _array(quantity["time"]), _array(quantity["measured"])

@@ -11,7 +11,7 @@ import numpy as np
 from countersteer.car.car import GRAVITY, Car, wheel_positions
 from countersteer.errors import InputError
 from countersteer.kept_programs import kept
-from countersteer.runs.files import Table
+from countersteer.runs.files import Table, drive_column
 from countersteer.runs.run import Run, drawn_car
 from countersteer.signals import Array, Motion, Wheels
 from countersteer.task.turns import sideslip
@@ -24,6 +24,7 @@ ROWS = 1024  # in each computation of forces; a fixed number, so that there is o
 UNJUDGED: dict[str, Any] = {"completed": False, "wall_contacts": None, "turns": []}
 WHEELS = ("fl", "fr", "rl", "rr")
 MOTION = ("vx_mps", "vy_mps", "yaw_rate_radps", "steering_rad")
+ASKED = {"throttle": "throttle", "speed": "commanded_speed_mps"}  # key by column of commands
 COLUMNS = (*MOTION, *(f"wheel_{wheel}_radps" for wheel in WHEELS))
 
 
@@ -40,6 +41,7 @@ def view_of(run: Run) -> dict[str, Any]:
     period = float(np.median(np.diff(time))) if len(time) > 1 else PERIOD
     every = slice(None, None, max(1, round(PERIOD / max(period, 1e-6))))
     command = np.maximum(np.searchsorted(run.commands["time_s"], time + 1e-9, "right") - 1, 0)
+    drive = drive_column(run.commands)
     vx, vy, steering = truth["vx_mps"], truth["vy_mps"], truth["steering_rad"]
     shown = {
         "speed_mps": np.hypot(vx, vy),
@@ -47,7 +49,7 @@ def view_of(run: Run) -> dict[str, Any]:
         "yaw_rate_degps": np.degrees(truth["yaw_rate_radps"]),
         "steering_deg": np.degrees(steering),
         "steering_command_deg": np.degrees(run.commands["steering"][command]),
-        "throttle": run.commands["throttle"][command],
+        ASKED[drive]: run.commands[drive][command],
     } | {name: truth[name] for name in ("time_s", "x_m", "y_m", "heading_rad")}
     place = about.get("course", {}).get("name", "open floor")
     body, tires = car.body, planar.tires_by_wheel(car)

@@ -37,8 +37,17 @@ import numpy as np
 
 from countersteer.car.car import Car, wheel_positions
 from countersteer.car.parameter import pytree
-from countersteer.signals import Array, Command, Motion, Scalar, Wheels
-from countersteer.world import battery, chassis, drivetrain, motor, servo, tyre, walls
+from countersteer.signals import AnyCommand, Array, Command, Motion, Scalar, Wheels
+from countersteer.world import (
+    battery,
+    chassis,
+    drivetrain,
+    motor,
+    servo,
+    speed_controller,
+    tyre,
+    walls,
+)
 from countersteer.world.angle import cosine_sine
 from countersteer.world.chassis import Symmetric, Vector, combine, dot, times
 from countersteer.world.floor import Floor, under_wheels
@@ -57,8 +66,8 @@ class Tick(NamedTuple):
 
     car: Car
     walls: jax.Array  # (n, 4): x, y of both ends, m; rows of NaN are padding
-    command: Command  # as it reaches the car now
-    asked: Command  # as it reaches motor and servo, after their delays
+    command: AnyCommand  # as it reaches the car now
+    asked: AnyCommand  # as it reaches motor and servo, after their delays
     count: Scalar  # ticks since the start, an integer
     dt: float
     floor: Floor | None = None  # None: uniform friction
@@ -118,15 +127,15 @@ def step(
     car: Car,
     around: jax.Array,
     state: State,
-    command: Command,
+    command: AnyCommand,
     count: Scalar,
     dt: float,
     floor: Floor | None = None,
 ) -> State:
     """One tick of dt seconds. Pure; works under `jit`, `vmap` (the count unbatched) and `grad`.
 
-    Throttle is in [-1, 1], steering in rad. Precision is that of the car's leaves. Without a
-    `floor`, friction is uniform and costs no computation.
+    Throttle is in [-1, 1], steering in rad, a commanded speed in m/s. Precision is that of the
+    car's leaves. Without a `floor`, friction is uniform and costs no computation.
     """
     tick = Tick(car, around, command, command, count, dt, floor, state.motion)
     for stage in STAGES:
@@ -136,14 +145,11 @@ def step(
 
 def delay(state: State, tick: Tick) -> tuple[State, Tick]:
     """Apply the pure delays of throttle and steering, with interpolation between ticks."""
-    throttle_line, throttle = _delayed(
-        state.throttle_line, tick.command.throttle, tick.car.motor.delay, tick
-    )
-    steering_line, steering = _delayed(
-        state.steering_line, tick.command.steering, tick.car.servo.delay, tick
-    )
+    asked, steered = tick.command
+    throttle_line, asked = _delayed(state.throttle_line, asked, tick.car.motor.delay, tick)
+    steering_line, steering = _delayed(state.steering_line, steered, tick.car.servo.delay, tick)
     state = state._replace(throttle_line=throttle_line, steering_line=steering_line)
-    return state, tick._replace(asked=Command(throttle, steering))
+    return state, tick._replace(asked=type(tick.command)(asked, steering))
 
 
 def _delayed(line: Array, now: Scalar, time: Scalar, tick: Tick) -> tuple[Array, Scalar]:
@@ -167,7 +173,7 @@ def move(state: State, tick: Tick) -> tuple[State, Tick]:
     """The motion over the tick: coefficients at its middle, then two implicit stages."""
     car, h, start = tick.car, tick.dt, state.motion
     goal = Command(
-        motor.duty(car.motor, tick.asked.throttle),
+        speed_controller.goal_duty(car, tick.asked, start.wheels),
         servo.target(car.servo, tick.asked.steering),
     )
     velocity = Vector(start.vx, start.vy, start.yaw_rate)
@@ -509,7 +515,7 @@ class Planar:
         """The car at x, y, heading with velocity vx, vy, yaw rate. See `initial_state`."""
         return initial_state(self.car, self.dt, pose, velocity, charge, self.slots)
 
-    def step(self, state: State, command: Command, tick: Scalar) -> State:
+    def step(self, state: State, command: AnyCommand, tick: Scalar) -> State:
         """One tick."""
         return step(self.car, self.walls, state, command, tick, self.dt, self.floor)
 

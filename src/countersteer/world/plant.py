@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from countersteer.car.car import Car
-from countersteer.signals import Array, Command, Motion, Scalar
-from countersteer.world import motor, planar, servo
+from countersteer.signals import AnyCommand, Array, Command, Motion, Scalar, Wheels
+from countersteer.world import planar, servo, speed_controller
 from countersteer.world.floor import Floor
 from countersteer.world.planar import State
 
@@ -30,21 +30,23 @@ def delayed(line: Array, ticks: Scalar) -> Array:
     return here + part * (there - here)
 
 
-def as_it_arrives(car: Car, asked: Command, dt: float) -> Command:
+def as_it_arrives(car: Car, asked: AnyCommand, dt: float) -> AnyCommand:
     """Commands (ticks,) as they reach motor and servo, after the car's pure delays."""
-    return Command(
-        delayed(asked.throttle, car.motor.delay / dt),
-        delayed(asked.steering, car.servo.delay / dt),
+    drive, steering = asked
+    return type(asked)(
+        delayed(drive, car.motor.delay / dt), delayed(steering, car.servo.delay / dt)
     )
 
 
-def settled(car: Car, commands: Command, dt: float) -> tuple[Scalar, Scalar]:
+def settled(car: Car, commands: AnyCommand, wheels: Wheels, dt: float) -> tuple[Scalar, Scalar]:
     """Steering angle (rad) and duty after commands (ticks,).
 
-    They begin at the steady state of the first command.
+    They begin at the steady state of the first command. `wheels` (ticks,) are the spins that a
+    speed controller measures; throttles do not need them.
     """
     goals = Command(
-        motor.duty(car.motor, commands.throttle), servo.target(car.servo, commands.steering)
+        speed_controller.goal_duty(car, commands, wheels),
+        servo.target(car.servo, commands.steering),
     )
 
     def settle(at: tuple[Scalar, Scalar], goal: Command) -> tuple[tuple[Scalar, Scalar], None]:
@@ -68,7 +70,7 @@ def state_of(car: Car, motion: Motion, dt: float) -> State:
 def rollout(
     car: Car,
     state: State,
-    commands: Command,
+    commands: AnyCommand,
     every: int,
     dt: float,
     look: Callable[[State], Seen],
@@ -83,7 +85,7 @@ def rollout(
     nowhere = jnp.full((1, 4), jnp.nan)
     stages = (planar.move,) if walls is None else (planar.move, planar.collide, planar.judge)
 
-    def tick(state: State, now: Command) -> tuple[State, None]:
+    def tick(state: State, now: AnyCommand) -> tuple[State, None]:
         work = planar.Tick(
             car, nowhere if walls is None else walls, now, now, 0, dt, floor, state.motion
         )
@@ -91,7 +93,7 @@ def rollout(
             state, work = stage(state, work)
         return state, None
 
-    def sample(state: State, now: Command) -> tuple[State, Seen]:
+    def sample(state: State, now: AnyCommand) -> tuple[State, Seen]:
         state, _ = jax.lax.scan(tick, state, now)
         return state, look(state)
 

@@ -9,7 +9,7 @@ class State(NamedTuple):
     """A car in its world between two ticks."""
 
     motion: Motion
-    throttle_line: Array  # commands within the pure delays, one slot a tick
+    throttle_line: Array  # commands within the pure delays, one slot a tick; or speeds
     steering_line: Array
     airborne: Scalar  # time for which a pair of wheels has had no load, s
     touching: Scalar  # remaining time in which a contact counts as the same touch, s

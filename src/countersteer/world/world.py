@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple, Protocol
 
 from countersteer.car.car import Car
-from countersteer.signals import Command, Motion, Scalar
+from countersteer.signals import AnyCommand, Motion, Scalar
 
 
 class Events(NamedTuple):
@@ -38,7 +38,7 @@ class World(Protocol):
         """The state of a car at x, y, heading with velocity vx, vy, yaw rate. Its wheels roll."""
         ...
 
-    def step(self, state: Any, command: Command, tick: Scalar) -> Any:
+    def step(self, state: Any, command: AnyCommand, tick: Scalar) -> Any:
         """The state one tick later. `tick` counts the ticks before it, the same in a batch."""
         ...
 

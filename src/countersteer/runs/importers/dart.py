@@ -18,14 +18,8 @@ import numpy as np
 
 from countersteer.errors import InputError
 from countersteer.runs.defects import SLACK, SLACK_YAW
-from countersteer.runs.files import (
-    COMMANDS,
-    LATEST,
-    Table,
-    read_table,
-    require,
-)
-from countersteer.runs.recorder import Recorder, whole_folder
+from countersteer.runs.files import LATEST, Table, read_table, require
+from countersteer.runs.importers.imported import Imported, at_centre, write_run
 
 FULL_LOCK = 25.0  # degrees, nominal angle of the front wheels at a steering of 1
 
@@ -115,17 +109,10 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
     about: dict[str, Any] = {
         "log_format": "dart",
         "car_name": CARS.get(log.resolve().parent.name, "jetracer"),
-        "source": log.name,
         "kind": found.kind,
         "full_lock_deg": FULL_LOCK,
         "sensors": SENSORS,
         "columns": list(table),
-        "rows": {
-            "log": len(table),
-            "commands": len(updates),
-            "telemetry": len(updates),
-            "truth": 0 if found.truth is None else len(found.truth["time_s"]),
-        },
         "repairs": repairs,
     }
     if found.truth is not None:
@@ -135,18 +122,10 @@ def import_dart(log: Path, out: Path) -> dict[str, Any]:
             else "at the centre of mass in the file itself"
         )
     steering = np.radians(FULL_LOCK * updates["steering"])
-    headers = {"commands": COMMANDS, "telemetry": tuple(telemetry)}
-    tables = {
-        "commands": (updates["time_s"], throttle, steering),
-        "telemetry": tuple(telemetry.values()),
-    }
-    if found.truth is not None:
-        headers["truth"] = tuple(found.truth)
-        tables["truth"] = tuple(found.truth.values())
-    folder = out / log.stem
-    with whole_folder(folder) as part, Recorder(part, about, headers) as recorder:
-        recorder.write(tables)
-    return {"run": str(folder), "duration_s": float(updates["time_s"][-1]), **about}
+    imported = Imported(
+        about, len(table), updates["time_s"], throttle, steering, telemetry, found.truth
+    )
+    return write_run(log, out, imported)
 
 
 def _read(log: Path) -> Table:
@@ -197,13 +176,8 @@ def _captured(table: Table) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     repeated[1:] = np.all(np.diff(pose) == 0, axis=0) | (np.diff(time) == 0)
     possible = _possible(time, x, y, yaw, ~repeated)
     heading = np.unwrap(yaw[possible])
-    cosine, sine = np.cos(heading + YAW_ERROR), np.sin(heading + YAW_ERROR)
-    truth = {
-        "time_s": time[possible],
-        "x_m": x[possible] - cosine * POINT_X + sine * POINT_Y,
-        "y_m": y[possible] - sine * POINT_X - cosine * POINT_Y,
-        "heading_rad": heading + YAW_ERROR,
-    }
+    pose = at_centre(x[possible], y[possible], heading, (POINT_X, POINT_Y, YAW_ERROR))
+    truth = dict(zip(("time_s", "x_m", "y_m", "heading_rad"), (time[possible], *pose), strict=True))
     wraps = np.sum(np.abs(np.diff(yaw[possible])) > math.pi)
     return truth, {
         "frames_repeated": int(np.sum(repeated)),

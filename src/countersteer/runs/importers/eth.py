@@ -16,8 +16,8 @@ import numpy as np
 
 from countersteer.errors import InputError
 from countersteer.reading.arrays import read_arrays
-from countersteer.runs.files import COMMANDS, require
-from countersteer.runs.recorder import Recorder, whole_folder
+from countersteer.runs.files import require
+from countersteer.runs.importers.imported import Imported, write_run
 
 FULL_LOCK = 36.0  # degrees, nominal angle of the front wheels at a steering of 1
 
@@ -71,13 +71,11 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
     about: dict[str, Any] = {
         "log_format": "eth",
         "car_name": "eth",
-        "source": log.name,
         "kind": "motion capture with commands",
         "full_lock_deg": FULL_LOCK,
         "period_s": PERIOD,
         "velocity_lag_s": VELOCITY_LAG,
         "capture_point": "at the centre of mass, as published",
-        "rows": {"log": len(time), "commands": len(time), "truth": int(np.sum(~repeated))},
         "repairs": {
             "frames_repeated": int(np.sum(repeated)),
             "yaw_rates_false": int(np.sum(wrapped & ~repeated)),
@@ -86,17 +84,8 @@ def import_eth(log: Path, out: Path) -> dict[str, Any]:
         },
     }
     truth = {name: column[~repeated] for name, column in truth.items()}
-    tables = {
-        "commands": (time, throttle, np.radians(FULL_LOCK * steering)),
-        "truth": tuple(truth.values()),
-    }
-    folder = out / log.stem
-    with (
-        whole_folder(folder) as part,
-        Recorder(part, about, {"commands": COMMANDS, "truth": tuple(truth)}) as recorder,
-    ):
-        recorder.write(tables)
-    return {"run": str(folder), "duration_s": float(time[-1]), **about}
+    angle = np.radians(FULL_LOCK * steering)
+    return write_run(log, out, Imported(about, len(time), time, throttle, angle, truth=truth))
 
 
 def _read(log: Path) -> tuple[np.ndarray, np.ndarray]:
