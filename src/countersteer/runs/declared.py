@@ -1,4 +1,4 @@
-"""A log's tables as `[sensors]` of its `run.toml` declares them: in SI units, at the centre of mass.
+"""A log's tables in SI units and at the centre of mass, by `[sensors]` of its `run.toml`.
 
 A log's columns may hold another unit, or the poses of a marker beside the centre of mass. Both are
 corrected once, where the run is read. Lags, steps and the encoder's wheel are used where readings

@@ -708,7 +708,7 @@ def _refuse_turning(run: Run, car: Car) -> None:
     # In a drift the front wheels point the other way. A car that hardly turns does not drift.
     gentle = turns & (speed * np.abs(rate) < GENTLE)
     found = _ratio(rate, expected, gentle)
-    if found and -COARSE < found[0] and found[1] < -1 / COARSE:
+    if found and found[0] > -COARSE and found[1] < -1 / COARSE:
         at = float(time[np.argmax(gentle)])
         raise InputError(
             f"{file}, {at:.2f} s: gyro_radps and steering_deg have opposite signs: both are "

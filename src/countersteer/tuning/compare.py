@@ -31,6 +31,7 @@ from countersteer.tuning import fit
 from countersteer.tuning.windows import (
     CHANGES,
     EARLY,
+    MEAN,
     QUANTITIES,
     SLOWEST,
     Measured,
@@ -156,6 +157,8 @@ class Simulation:
         """`starts` are ticks, and a window has `ticks` of them. See `compared` for `whole`."""
         self.car, self.commands, self.ticks, self.dt = car, run.commands, ticks, dt
         self.references, self.whole = find_references(measured), whole
+        wheel = self.references.get("wheel_speed_mps")
+        self.sees = MEAN if wheel is None else wheel.sees
         with jax.enable_x64(True):
             states = states_at(run, car, measured, starts, resting, dt)
         known = np.isfinite(states.motion.vx + states.motion.vy + states.motion.yaw_rate)
@@ -171,7 +174,9 @@ class Simulation:
             motion = states.motion
             states = states._replace(motion=motion._replace(charge=0 * motion.charge + charge))
         with jax.enable_x64(True):
-            predicted = simulate(self.car, states, self.commands, self.starts, self.ticks, dt)
+            predicted = simulate(
+                self.car, states, self.commands, self.starts, self.ticks, dt, self.sees
+            )
         found: list[Window] = []
         kept = []
         for i, start in enumerate(self.starts.tolist()):
