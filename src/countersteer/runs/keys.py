@@ -125,6 +125,7 @@ ABOUT = Keys(
         "laps": _whole(1, 1000),
         "precision_bits": _one_of(32, 64),
         "battery_charge": _number(0, 1),
+        "battery_charge_end": _number(0, 1),
         "velocity_lag_s": _number(-10, 10),
         "line_spacing_m": _number(1e-6, FARTHEST),
         "start": _POSE,

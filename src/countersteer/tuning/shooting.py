@@ -106,7 +106,7 @@ def take(
         mean,
         Wheels(*(np.full(len(starts), share) for share in sees)),
         rims,
-        np.full(len(starts), float(run.about.get("battery_charge", math.nan))),
+        windows.charges(run, time, math.nan),
         throttle,
         steering,
         np.stack(seen, axis=1),

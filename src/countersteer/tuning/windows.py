@@ -154,8 +154,12 @@ def encoder_on(run: Run, car: Car) -> str:
 
 
 def encoder_sees(run: Run, car: Car) -> Wheels:
-    """The share of each wheel in the encoder's speed; the shaft's is that of the driven wheels."""
-    on = encoder_on(run, car)
+    """The share of each wheel in the encoder's speed."""
+    return shares(encoder_on(run, car), car)
+
+
+def shares(on: str, car: Car) -> Wheels:
+    """The share of each wheel in what an encoder sees there; the shaft's is of driven wheels."""
     if on != "shaft":
         return Wheels(*(float(on == place) for place in ENCODER_ON[1:]))
     front = float(car.drivetrain.front_share) / 2
@@ -287,6 +291,34 @@ def _closed(armed: Signal | None, begin: np.ndarray, end: np.ndarray) -> np.ndar
     return (first >= 0) & (opened[beyond] == opened[np.maximum(first, 0)])
 
 
+def why_no_window(run: Run, measured: Measured, horizon: float) -> str:
+    """Why a run has no window of `horizon` seconds."""
+    where = f"{run.path}: no window of {horizon:g} s: "
+    if measured.vx is None and "wheel_speed_mps" not in find_references(measured):
+        there = "truth.csv" if run.truth is not None else "telemetry.csv"
+        empty = run.telemetry is not None and "wheel_speed_mps" in run.telemetry
+        cause = "is empty" if empty else "is missing"
+        return (
+            f"{where}it has no speed signal: wheel_speed_mps {cause} in telemetry.csv, and "
+            + ("truth.csv holds no poses" if there == "truth.csv" else "there is no truth.csv")
+        )
+    time = run.commands["time_s"]
+    if time[-1] - time[0] < horizon:
+        return f"{where}its commands last {time[-1] - time[0]:.3g} s"
+    if measured.armed is not None and not np.any(measured.armed.value >= 0.5):
+        return f"{where}the dead-man switch is never closed (armed in telemetry.csv)"
+    every = np.arange(time[0], time[-1], 0.05)
+    speed = speed_at(measured, every, False)
+    if not np.any(np.isfinite(speed)):
+        return f"{where}its speed is not known while it has commands: do the clocks agree?"
+    if np.nanmax(speed) < SLOWEST:
+        return f"{where}its speed stays below {SLOWEST:g} m/s (at most {np.nanmax(speed):.2g})"
+    return (
+        f"{where}in none is the dead-man switch closed and the car at {SLOWEST:g} m/s or more, or "
+        "at rest with a throttle onset"
+    )
+
+
 # -------------------------------------------------------------------------------------------------
 # Simulation
 # -------------------------------------------------------------------------------------------------
@@ -307,7 +339,7 @@ def states_at(
     zero = np.zeros(len(time))
     vx, vy, yaw_rate, ax, ay = body_at(car, measured, angle, time, resting)
     wheels = wheels_at(car, measured, Vector(vx, vy, yaw_rate), angle, time, resting)
-    charge = zero + float(run.about.get("battery_charge", 1.0))
+    charge = charges(run, time, 1.0)
     motion = Motion(zero, zero, zero, vx, vy, yaw_rate, wheels, angle, duty, ax, ay, charge)
     slots = planar.delay_slots(car, dt)
     # A window's count starts at 0, so its slot s holds the command of the tick s - slots.
@@ -316,6 +348,17 @@ def states_at(
         np.where(before >= 0, line[np.maximum(before, 0)], 0.0) for line in (throttle, steering)
     )
     return State(motion, throttle_line, steering_line, *[zero] * 5)
+
+
+def charges(run: Run, time: np.ndarray, unknown: float) -> np.ndarray:
+    """The battery's charge at these times as the run states it, else `unknown`.
+
+    `battery_charge` is that of its first command. It falls evenly to `battery_charge_end`, if given.
+    """
+    begin = float(run.about.get("battery_charge", unknown))
+    end = float(run.about.get("battery_charge_end", begin))
+    first, last = run.commands["time_s"][[0, -1]]
+    return np.interp(time, [first, max(last, first + EARLY)], [begin, end])
 
 
 def body_at(
