@@ -106,6 +106,11 @@ def another_pack(car: Car, volts: float) -> str:
     """Why a typical reading cannot be of the car's pack; empty if it can."""
     full = float(car.battery.full)
     empty = float(battery.open_circuit(car.battery, 0.0))
+    if empty < volts / 1000 <= BEYOND * full:
+        return (
+            f'battery_v reads {volts:.4g} V: in millivolts? Convert it, or write unit = "mV" '
+            "under [sensors.voltmeter] of run.toml: not used"
+        )
     if volts > BEYOND * full:
         return (
             f"battery_v reads {volts:.4g} V, more than a full pack of the car has "

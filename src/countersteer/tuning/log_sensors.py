@@ -61,7 +61,7 @@ ANGLES = np.linspace(-1.2, 1.2, 481)  # rad, of steering, between which wheels a
 ALIGNED, AWAY = math.radians(2), 0.2  # rad, m; prior deviations of yaw offset and capture point
 SLIP_KNOWN, SLIDES_BY = 0.3, 0.01  # part of a slip angle, m/s of lateral velocity without slip
 TURNING, LONG_ENOUGH = 3.0, 1.0  # times `SLIDES_BY` at the rear axle, s: turns that tell the point
-SLIP_BY = 0.5  # relative prior deviation of the slip under drive
+SLIP_BY = 0.25  # relative prior deviation of the slip under drive
 NOISY = 0.005  # m, noise of poses from which velocities are poor
 
 
@@ -386,9 +386,7 @@ def course_of(run: Run, car: Car, measured: Measured, dt: float) -> Course:
     return Course(time, vx, vy, rate, steering)
 
 
-def from_motion_capture(
-    run: Run, car: Car, measured: Measured, course: Course
-) -> list[Estimate]:
+def from_motion_capture(run: Run, car: Car, measured: Measured, course: Course) -> list[Estimate]:
     """The capture point, the yaw offset, and the lags of encoder and gyroscope."""
     moves = capture_point(run, car, course)
     found = list(moves)
@@ -428,8 +426,9 @@ def capture_point(run: Run, car: Car, course: Course) -> list[Estimate]:
     own = sensor_tables(run.about, "capture")
     yaw, forward = (float(v) for v in found.value[:2])
     # The table was moved by what is declared. The estimate is what is left.
-    x, offset = forward - back + own.get("x_m", 0.0), yaw + math.radians(
-        own.get("yaw_offset_deg", 0.0)
+    x, offset = (
+        forward - back + own.get("x_m", 0.0),
+        yaw + math.radians(own.get("yaw_offset_deg", 0.0)),
     )
     return [
         estimated(run, "capture", "x_m", convention, x, float(found.deviation[1])),
@@ -565,6 +564,6 @@ def wheel_warning(run: Run, car: Car, measured: Measured, course: Course) -> lis
         return []
     return [
         f"the encoder reads as one on the {best} would (off by {spread[best]:.3f} m/s), not as one "
-        f"on the {declared} ({spread[declared]:.3f} m/s): write on = \"{best}\" under "
+        f'on the {declared} ({spread[declared]:.3f} m/s): write on = "{best}" under '
         "[sensors.encoder] of run.toml, unless the captured point is beside the middle"
     ]

@@ -298,9 +298,8 @@ def why_no_window(run: Run, measured: Measured, horizon: float) -> str:
         there = "truth.csv" if run.truth is not None else "telemetry.csv"
         empty = run.telemetry is not None and "wheel_speed_mps" in run.telemetry
         cause = "is empty" if empty else "is missing"
-        return (
-            f"{where}it has no speed signal: wheel_speed_mps {cause} in telemetry.csv, and "
-            + ("truth.csv holds no poses" if there == "truth.csv" else "there is no truth.csv")
+        return f"{where}it has no speed signal: wheel_speed_mps {cause} in telemetry.csv, and " + (
+            "truth.csv holds no poses" if there == "truth.csv" else "there is no truth.csv"
         )
     time = run.commands["time_s"]
     if time[-1] - time[0] < horizon:
@@ -353,7 +352,7 @@ def states_at(
 def charges(run: Run, time: np.ndarray, unknown: float) -> np.ndarray:
     """The battery's charge at these times as the run states it, else `unknown`.
 
-    `battery_charge` is that of its first command. It falls evenly to `battery_charge_end`, if given.
+    `battery_charge` is that of its first command. It falls evenly to `battery_charge_end`.
     """
     begin = float(run.about.get("battery_charge", unknown))
     end = float(run.about.get("battery_charge_end", begin))
@@ -426,8 +425,10 @@ def rolls(car: Car, steering: Scalar) -> Wheels:
 def seen_by(sees: Wheels, directions: Wheels) -> Vector:
     """The direction of the hub speed that an encoder sees."""
     return Vector(
-        *(sum(share * part for share, part in zip(sees, parts, strict=True))
-          for parts in zip(*directions, strict=True))
+        *(
+            sum(share * part for share, part in zip(sees, parts, strict=True))
+            for parts in zip(*directions, strict=True)
+        )
     )
 
 
