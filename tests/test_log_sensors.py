@@ -293,9 +293,9 @@ def test_units_and_signs_are_told_without_motion_capture(column, factor, words):
 def test_a_log_without_a_speed_signal_is_told_so():
     with pytest.raises(InputError, match=r"no speed signal: wheel_speed_mps is missing"):
         compare(own_log(wheel_speed_mps=None), load_car(CAR))
+    still = own_log(wheel_speed_mps=np.full(400, 0.1))
+    still.commands["throttle"][:] = 0
     with pytest.raises(InputError, match=r"stays below 0.2 m/s"):
-        still = own_log(wheel_speed_mps=np.full(400, 0.1))
-        still.commands["throttle"][:] = 0
         compare(still, load_car(CAR))
 
 

@@ -60,7 +60,7 @@ MOST_STEPS = 500  # in the largest reading, to which a step is searched finely
 ANGLES = np.linspace(-1.2, 1.2, 481)  # rad, of steering, between which wheels are interpolated
 ALIGNED, AWAY = math.radians(2), 0.2  # rad, m; prior deviations of yaw offset and capture point
 SLIP_KNOWN, SLIDES_BY = 0.3, 0.01  # part of a slip angle, m/s of lateral velocity without slip
-TURNING, LONG_ENOUGH = 3.0, 1.0  # times `SLIDES_BY` at the rear axle, s: turns that tell the point
+TURNING, LONG_ENOUGH = 4.0, 1.0  # times `SLIDES_BY` at the rear axle, s: turns that tell it
 SLIP_BY = 0.25  # relative prior deviation of the slip under drive
 NOISY = 0.005  # m, noise of poses from which velocities are poor
 
@@ -391,7 +391,9 @@ def from_motion_capture(run: Run, car: Car, measured: Measured, course: Course) 
     moves = capture_point(run, car, course)
     found = list(moves)
     if measured.encoder is not None:
-        point = moves[0].value - moves[0].declared if moves and moves[0].sure else 0.0
+        before = sensor_tables(run.about, "capture").get("x_m", 0.0)
+        points = [one.value - before for one in moves if one.kind.key == "x_m" and one.sure]
+        point = points[0] if points else 0.0
         moved = course._replace(vy=course.vy - course.yaw_rate * point)
         found += encoder_lag(run, car, measured, moved)
     if measured.gyro is not None:
@@ -400,7 +402,7 @@ def from_motion_capture(run: Run, car: Car, measured: Measured, course: Course) 
 
 
 def capture_point(run: Run, car: Car, course: Course) -> list[Estimate]:
-    """The captured point forward of the centre of mass, and the yaw offset."""
+    """The yaw offset, and the captured point forward of the centre of mass if the log turns."""
     body, rear = car.body, car.tires.rear
     back = float(body.wheelbase - body.front_axle)
     vx, vy, rate = course.vx, course.vy, course.yaw_rate
@@ -411,11 +413,10 @@ def capture_point(run: Run, car: Car, course: Course) -> list[Estimate]:
     stiff = 1 / (GRAVITY * float(rear.cornering_stiffness))
     slow = (vx > DRIVES) & (np.abs(held) < GENTLE * grip * GRAVITY) & (np.abs(turns) < JERKS)
     slow &= np.abs(course.slope(vx)) < GENTLE * grip * GRAVITY
-    turning = slow & (np.abs(rate) * back > TURNING * SLIDES_BY)
-    if np.sum(turning) * float(np.median(np.diff(course.time))) < LONG_ENOUGH:
-        return []
     # The slip angle is known to a part only. So the slowest turns count most.
     weight = 1 / np.hypot(1.0, SLIP_KNOWN * stiff * vx * held / SLIDES_BY)
+    turning = slow & (weight * np.abs(rate) * back > TURNING * SLIDES_BY)
+    told = np.sum(turning) * float(np.median(np.diff(course.time))) >= LONG_ENOUGH
     design = weight[:, None] * np.stack([-vx, rate, -vx * held], axis=1)
     prior = Prior((0.0, back, stiff), (ALIGNED, AWAY, stiff))
     target = np.where(slow, weight * vy, math.nan)
@@ -430,13 +431,20 @@ def capture_point(run: Run, car: Car, course: Course) -> list[Estimate]:
         forward - back + own.get("x_m", 0.0),
         yaw + math.radians(own.get("yaw_offset_deg", 0.0)),
     )
-    return [
-        estimated(run, "capture", "x_m", convention, x, float(found.deviation[1])),
+    deviations = found.deviation[:2].tolist()
+    whole = [
         estimated(
-            run, "capture", "yaw_offset_deg", convention,
-            math.degrees(offset), math.degrees(found.deviation[0]),
-        ),
-    ]  # fmt: skip
+            run,
+            "capture",
+            "yaw_offset_deg",
+            convention,
+            math.degrees(offset),
+            math.degrees(deviations[0]),
+        )
+    ]
+    if told:
+        whole.append(estimated(run, "capture", "x_m", convention, x, deviations[1]))
+    return whole
 
 
 def encoder_fit(

@@ -27,10 +27,10 @@ class Logs(NamedTuple):
     """Windows of runs, with their start times (s)."""
 
     runs: list[Run]
-    sensors: list[LogSensors]
     masked: list[str]  # a line for each repair and each stretch left out
     shots: Shots
     start: np.ndarray
+    sensors: list[LogSensors]  # of each run
 
     @property
     def run(self) -> np.ndarray:
@@ -51,10 +51,10 @@ class Logs(NamedTuple):
         after = other.shots._replace(run=other.run + len(self.runs))
         return Logs(
             self.runs + other.runs,
-            self.sensors + other.sensors,
             self.masked + other.masked,
             shooting.joined([self.shots, after]),
             np.concatenate([self.start, other.start]),
+            self.sensors + other.sensors,
         )
 
 
@@ -76,7 +76,7 @@ def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: 
         words += [_defect_line(run, defect) for defect in found]
     surfaces = [surface_of(run, cars, base) for run in clean]
     shots, start = fit.take_shots(clean, dict(cars), surfaces, masks, every)
-    return Logs(clean, sensors, words, shots, start)
+    return Logs(clean, words, shots, start, sensors)
 
 
 def _defect_line(run: Run, defect: LogDefect) -> str:

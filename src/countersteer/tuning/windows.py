@@ -36,6 +36,8 @@ SMOOTHED_OVER, DEGREE = 0.15, 3  # s, width of the Savitzky-Golay filter, and it
 MOST_POSES = 10_000_000  # after resampling
 GAP = 0.035  # s; longer gaps of motion capture are not interpolated
 
+MEAN = Wheels(0.25, 0.25, 0.25, 0.25)  # share of each wheel in their mean
+
 PIECE = 100  # ticks in each call of the compiled program, for any horizon
 SIZES = (1, 32, 256)  # windows simulated at once; few sizes, as each compiles its own program
 ENDS = 0.02  # s before the first and after the last sample of a signal, in which it still holds
@@ -72,13 +74,10 @@ class Measured(NamedTuple):
     wheels: tuple[Signal, ...] | None  # rim speeds of the four, for simulated cars only
     encoder: Signal | None  # as reported
     encoder_timing: Timing
-    encoder_sees: Wheels  # share of each wheel in the encoder's speed
     gyro: Signal | None
     gyro_timing: Timing
     armed: Signal | None  # dead-man switch, held between its reports; None: always closed
-
-
-MEAN = Wheels(0.25, 0.25, 0.25, 0.25)  # share of each wheel in their mean
+    encoder_sees: Wheels = MEAN  # share of each wheel in the encoder's speed
 
 
 class Reference(NamedTuple):
@@ -135,10 +134,10 @@ def read_measured(run: Run, car: Car) -> Measured:
         wheels,
         _reported(telemetry, "wheel_speed_mps"),
         encoder_timing(run, car),
-        encoder_sees(run, car),
         _reported(telemetry, "gyro_radps"),
         gyro_timing(run),
         _reported(telemetry, "armed"),
+        encoder_sees(run, car),
     )
 
 
