@@ -144,7 +144,9 @@ def test_an_encoder_on_another_wheel_than_declared_is_named(driven):
     capture = {"x_m": X, "y_m": Y, "yaw_offset_deg": OFFSET}
 
     def warnings(on: str) -> list[str]:
-        about = {"sensors": {"encoder": {"over_s": OVER, "on": on}, "capture": capture}}
+        encoder = {"over_s": OVER, "lag_s": ENCODER_LAG, "step_mps": STEP, "on": on}
+        gyro = {"lag_s": GYRO_LAG}
+        about = {"sensors": {"encoder": encoder, "gyroscope": gyro, "capture": capture}}
         run = dataclasses.replace(logged, about=about, truth=truth_at_centre(about, logged.truth))
         return resolve(run, load_car(CAR), DT).warnings
 

@@ -64,7 +64,7 @@ def moved_to_centre(table: Table, x: float, y: float, yaw_offset: float) -> Tabl
     )
     if {"vx_mps", "vy_mps", "yaw_rate_radps"} <= table.keys():
         vx, vy, rate = (table[n] for n in ("vx_mps", "vy_mps", "yaw_rate_radps"))
-        cosine, sine = math.cos(yaw_offset), math.sin(yaw_offset)
-        moved["vx_mps"] = cosine * vx - sine * vy + rate * y
-        moved["vy_mps"] = sine * vx + cosine * vy - rate * x
+        ahead, aside = math.cos(yaw_offset), math.sin(yaw_offset)
+        moved["vx_mps"] = ahead * vx - aside * vy + rate * y
+        moved["vy_mps"] = aside * vx + ahead * vy - rate * x
     return moved
