@@ -18,6 +18,7 @@ from countersteer.drivers.registry import make_driver
 from countersteer.errors import InputError
 from countersteer.reading.content import read_bytes, reading
 from countersteer.reading.values import number, shown, whole
+from countersteer.runs.defects import find_defects
 from countersteer.runs.files import read_commands
 from countersteer.runs.importers.dart import import_dart
 from countersteer.runs.importers.eth import import_eth
@@ -602,8 +603,18 @@ RIGHT = {
     "bad-yaml-merge-bomb": (["drive", "m.yaml"], 2, "aliases"),
     "dart-blank-last-line": (["import", "dart", "log.csv", "good.csv", "--out", "OUT"], 0, ""),
     "speed-commanded": (["replay", "commands.csv", "--out", "OUT"], 2, "column speed_mps"),
+    "own-log-gyro-degps": (["replay", ".", "--compare", "--out", "OUT"], 2, "in degrees"),
     "own-log-epoch": (["replay", ".", "--compare", "--out", "OUT"], 2, "Unix time"),
 }
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="the cases are not here")
+def test_rows_of_one_topic_are_as_good_as_one_row():
+    topics = read_run(CASES / "telemetry-row-a-topic")
+    rows = read_run(CASES / "telemetry-row-a-topic" / "same-in-one-row")
+    for name, column in rows.telemetry.items():
+        np.testing.assert_array_equal(topics.telemetry[name], column)
+    assert find_defects(topics) == find_defects(rows) == []
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="the cases are not here")

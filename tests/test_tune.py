@@ -14,10 +14,11 @@ from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
 from countersteer.cli import main
 from countersteer.errors import InputError
-from countersteer.runs.files import COMMANDS, TableWriter, command_rows
+from countersteer.runs.files import COMMANDS, Table, TableWriter, command_rows
 from countersteer.runs.run import Run, read_run
 from countersteer.tuning import fit, tune
 from countersteer.tuning.compare import compare
+from countersteer.tuning.log_sensors import resolve
 from countersteer.tuning.shooting import Shots
 from countersteer.world import plant
 from studies import folds
@@ -152,7 +153,12 @@ def test_how_full_a_battery_was_is_found_where_the_log_does_not_tell(logs, tmp_p
         main([*command, "--battery", f"{charge}", "--out", str(out)])
         run = read_run(out)
         about = {key: value for key, value in run.about.items() if key != "battery_charge"}
-        untold.append(dataclasses.replace(run, about=about))
+        metered = dataclasses.replace(run, about=about)
+        found = resolve(metered, true, 0.002)
+        assert found.run.about["battery_charge"] == pytest.approx(charge, abs=0.03)
+        assert found.charge_from == "voltmeter"
+        silent = {name: v for name, v in run.telemetry.items() if name != "battery_v"}
+        untold.append(dataclasses.replace(metered, telemetry=Table(silent)))
     windows = tune.read_logs([*untold, read_run(tmp_path / "0.3")], cars, 0.5, "jetracer-tape")
     assert np.isnan(windows.shots.charge).mean() == pytest.approx(2 / 3, abs=0.05)
     found = fit.estimated_charge(cars, windows.shots)
@@ -267,7 +273,7 @@ def test_each_window_and_each_brief_log_is_left_out_once():
     start = np.concatenate([np.arange(0, 30, 0.25), *[np.arange(0, 5, 0.25)] * 4])
     run = np.repeat(np.arange(5), [120, 20, 20, 20, 20])
     shots = Shots(run, *[0 * run] * (len(Shots._fields) - 1))
-    logs = tune.Logs([], [], shots, start)
+    logs = tune.Logs([], [], shots, start, [])
     kind = np.stack([folds.kinds(logs, fold) for fold in range(folds.FOLDS)])
     assert np.all(np.sum(kind == 2, axis=0)[run > 0] == 1)
     assert np.all(np.sum(kind == 2, axis=0) <= 1)

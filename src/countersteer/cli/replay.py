@@ -145,17 +145,31 @@ def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) ->
     if options.json:
         print(json.dumps(result))
         return DONE
-    if not result["battery_known"]:
-        print(
-            f"battery: the log does not tell; {result['battery_charge']:.2f} of a full one agrees "
-            "best (--battery sets it)"
-        )
+    for line in comparison_lines(result):
+        print(line)
     print(f"{name}: {result['windows']} windows of {result['horizon_s']:g} s; error at their ends:")
     for quantity, error in result["median_abs_error"].items():
         nothing = result["persistence"]["median_abs_error"][quantity]
         print(f"  {quantity:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")
     print(f"picture: {out / 'compare.png'}")
     return DONE
+
+
+def comparison_lines(result: dict[str, Any]) -> list[str]:
+    """What a comparison says of the log's battery and sensors."""
+    charge = f"{result['battery_charge']:.2f} of a full one"
+    lines = {
+        "fit": [f"battery: the log does not tell; {charge} agrees best (--battery sets it)"],
+        "voltmeter": [f"battery: {charge}, by the log's voltmeter (--battery sets it)"],
+    }.get(result["battery_from"], [])
+    for one in result["sensors"]:
+        if one["determined"]:
+            deviation = f" ± {one['deviation']:.2g}" if one["deviation"] else ""
+            lines.append(
+                f"log: {one['sensor']}.{one['key']} {one['estimated']:.4g}{deviation} "
+                f"({one['declared_by']}: {one['declared']:.4g})"
+            )
+    return lines + [f"warning: {line}" for line in result["warnings"]]
 
 
 def read_initial(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

@@ -126,6 +126,9 @@ def tune_all(
         return DONE
     for line in tune.table_lines(about):
         print(line)
+    for name, told in about["sensors"].items():
+        for line in told["warnings"]:
+            print(f"warning: {name}: {line}")
     if new:
         print(about["new_runs"]["verdict"])
     print(f"cars: {', '.join(map(str, files.values()))}; page: {page}")

@@ -11,20 +11,24 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, percentile_filter
 
-from countersteer.car.car import GRAVITY
+from countersteer.car.car import GRAVITY, Car
 from countersteer.errors import InputError
-from countersteer.runs.files import Table, drive_column
+from countersteer.runs.files import SLOWEST_CLOCK, Table, clock_mistake, drive_column
 from countersteer.runs.run import Run, refuse_long
 
 # Clocks
 MISSED = 5.0  # periods between two rows that make a gap; every log has one or two late rows
 ROWS = 20  # fewest rows that give a period
-SLOWEST_CLOCK = 0.5  # s between rows; no sensor is so slow, so time_s may be in milliseconds
+REPEATED = 0.2  # part of the rows; if so many repeat a time, the clock is too coarse
 
 # Motion capture
-SLACK, SLACK_YAW = 0.02, 0.1  # m, rad; noise of poses, too small to give a speed
+SLACK, SLACK_YAW = 0.02, 0.1  # m, rad; noise of good poses, too small to give a speed
+NOISY = 6.0  # standard deviations of the poses' own noise; a jump is larger
+THIRD = math.sqrt(20)  # deviation of a third difference of white noise, over the noise's
+AROUND_NOISE = 2.0  # s
+TAIL, NORMAL_TAIL = 0.8, 1.2816  # quantile of a size, and the same of a normal variable's
 ABRUPT, ABRUPT_YAW = 3.0, 20.0  # m/s, rad/s; largest excess of a rate over the median around it
 AROUND = 0.3  # s, window of that median
 STANDS = 0.1  # m/s; a slower car may repeat a frame
@@ -37,7 +41,7 @@ SPAN_OF_POSES = 0.05  # s between differenced poses; 1 mm of noise then gives 1 
 SPAN_OF_VELOCITIES = 0.01  # s, the same for measured velocities
 BEFORE, AFTER = 0.05, 0.2  # s added before and after the visible hit
 IMPACT_RATE = 50.0  # Hz; at a lower rate, a single vibration looks like a hit
-QUIET = 6.0  # standard deviations of an accelerometer's noise that are added to the limit
+QUIET = 6.0  # standard deviations of an acceleration's noise that are added to the limit
 
 # Stuck sensors
 HELD, HELD_ALONE = 0.5, 1.0  # s of a constant reading, by how strong the evidence of motion is
@@ -51,12 +55,19 @@ STEERED = math.radians(5)  # rad; so much steering, or change of it, turns a mov
 FASTEST, FASTEST_YAW = 30.0, 60.0  # m/s, rad/s; no model car reaches them
 STEEPEST = math.radians(65)  # rad, the largest steering limit that a car may declare
 DEGREES = (45.0, 72.0)  # range of value / true value if the value is in degrees
+COARSE = 2.5  # factor within which speed, steering and a guessed wheelbase tell a yaw rate
+SERVO = 0.3  # s, by which the front wheels have followed the command
+SLOW = 0.2  # m/s; a slower car does not tell its yaw rate
+GENTLE = 1.0  # m/s² of lateral acceleration, within the grip of any floor
+LEAST_LOCK = math.radians(1.2)  # rad; no car steers so little
+DECLARE_DEGREES = 'convert it, or write unit = "deg/s" under [sensors.gyroscope] of run.toml'
 UNITS = {  # the same of speeds in other units
     "cm/s": (80.0, 125.0),
     "km/h": (3.2, 4.0),
     "mm/s": (800.0, 1250.0),
 }
 TELLING = 20  # fewest samples for a ratio
+TO_DEVIATION = 1.4826  # standard deviation of a normal variable over its median size
 
 
 class LogDefect(NamedTuple):
@@ -78,6 +89,7 @@ class Track(NamedTuple):
     vy: np.ndarray
     yaw_rate: np.ndarray  # rad/s
     span: float  # s, averaging time of a velocity
+    noise: np.ndarray  # m/s, standard deviation of a velocity's noise
 
     def at(self, values: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Interpolate a column of the track to other times; NaN where unknown."""
@@ -232,6 +244,29 @@ def frames(truth: Table) -> tuple[np.ndarray, np.ndarray]:
     return truth["time_s"][good], pose[:, good]
 
 
+def local_noise(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Standard deviation of a series' white noise around each sample, from third differences.
+
+    A motion is smooth over four samples. The noise of a particle filter grows in curves and has
+    long tails. So it is taken over `AROUND_NOISE` seconds, from the `TAIL` quantile of its size.
+    """
+    if len(time) < ROWS:
+        return np.zeros(len(time))
+    third = np.abs(np.diff(values, 3))
+    width = min(round(AROUND_NOISE / max(float(np.median(np.diff(time))), 1e-4)), len(third))
+    size = percentile_filter(third, 100 * TAIL, max(width, ROWS), mode="nearest")
+    return np.pad(size / NORMAL_TAIL / THIRD, (1, 2), mode="edge")
+
+
+def pose_noise(truth: Table) -> tuple[float, float]:
+    """Typical standard deviations of a position's (m) and of a heading's (rad) noise."""
+    time, pose = frames(truth)
+    if len(time) < ROWS:
+        return 0.0, 0.0
+    x, y, heading = (float(np.median(local_noise(time, line))) for line in pose)
+    return max(x, y), heading
+
+
 def usual(time: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """Rolling median of rates over `AROUND` seconds, or 7 rates if those are more."""
     width = 2 * max(3, round(AROUND / 2 / max(float(np.median(np.diff(time))), 1e-4))) + 1
@@ -250,15 +285,21 @@ def repeated_frames(truth: Table) -> Iterator[LogDefect]:
         yield LogDefect(*span, "motion capture repeats a frame while the car moves")
 
 
-def false_frames(time: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def slack(truth: Table) -> tuple[float, float]:
+    """How far a pose may be off by noise (m, rad)."""
+    noise, noise_yaw = pose_noise(truth)
+    return max(SLACK, NOISY * noise), max(SLACK_YAW, NOISY * noise_yaw)
+
+
+def false_frames(time: np.ndarray, pose: np.ndarray, off_by: tuple[float, float]) -> np.ndarray:
     """True for frames too far off the median of the five frames around them: (frames,).
 
-    The limit in position is `SLACK` + `MARGIN` `BEST_FRICTION` g h² / 2, with h two periods. The
-    limit in heading is `SLACK_YAW` + `ABRUPT_YAW` h / 2.
+    The limit in position is the slack + `MARGIN` `BEST_FRICTION` g h² / 2, with h two periods. The
+    limit in heading is the slack + `ABRUPT_YAW` h / 2. `off_by` is the `slack`.
     """
     reach = 2 * float(np.median(np.diff(time)))
-    limit = SLACK + MARGIN * BEST_FRICTION * GRAVITY * reach**2 / 2
-    limit_yaw = SLACK_YAW + ABRUPT_YAW * reach / 2
+    limit = off_by[0] + MARGIN * BEST_FRICTION * GRAVITY * reach**2 / 2
+    limit_yaw = off_by[1] + ABRUPT_YAW * reach / 2
     middle = median_filter(pose, (1, 5), mode="nearest")
     off = np.abs(pose - middle)
     return np.any(off > np.array([[limit], [limit], [limit_yaw]]), axis=0)
@@ -269,7 +310,8 @@ def jumps(truth: Table) -> Iterator[LogDefect]:
     time, pose = frames(truth)
     if len(time) < ROWS:
         return
-    false = false_frames(time, pose)
+    off_by = slack(truth)
+    false = false_frames(time, pose, off_by)
     for first, last in stretches(false):
         span = float(time[max(first - 1, 0)]), float(time[min(last + 1, len(time) - 1)])
         yield LogDefect(*span, "motion capture has a false frame")
@@ -277,8 +319,8 @@ def jumps(truth: Table) -> Iterator[LogDefect]:
     span = np.diff(time)
     moved, turned = np.hypot(*np.diff(pose[:2], axis=1)), np.abs(np.diff(pose[2]))
     speed, rate = usual(time, moved / span), usual(time, turned / span)
-    far = moved > SLACK + (speed + ABRUPT) * span
-    spun = turned > SLACK_YAW + (rate + ABRUPT_YAW) * span
+    far = moved > off_by[0] + (speed + ABRUPT) * span
+    spun = turned > off_by[1] + (rate + ABRUPT_YAW) * span
     for i in np.flatnonzero(far | spun).tolist():
         by = f"{moved[i]:.2f} m" if far[i] else f"{math.degrees(turned[i]):.0f}°"
         yield LogDefect(float(time[i]), float(time[i + 1]), f"motion capture jumps by {by}")
@@ -316,19 +358,23 @@ def follow(truth: Table) -> Track | None:
         vx, vy, rate = (np.where(np.isfinite(v), v, math.nan) for v in told)
         cosine, sine = np.cos(heading), np.sin(heading)
         east, north = cosine * vx - sine * vy, sine * vx + cosine * vy
-        return Track(time, east, north, vx, vy, rate, SPAN_OF_VELOCITIES)
-    good = ~false_frames(time, pose)
+        noise = np.maximum(*(local_noise(time, np.nan_to_num(line)) for line in (east, north)))
+        return Track(time, east, north, vx, vy, rate, SPAN_OF_VELOCITIES, noise)
+    good = ~false_frames(time, pose, slack(truth))
     good[1:] &= np.any(np.diff(pose, axis=1) != 0, axis=0)
     kept, pose = time[good], pose[:, good]
     if len(kept) < ROWS:
         return None
-    half = max(1, math.ceil(SPAN_OF_POSES / 2 / float(np.median(np.diff(kept))) - 0.01))
+    step = float(np.median(np.diff(kept)))
+    half = max(1, math.ceil(SPAN_OF_POSES / 2 / step - 0.01))
+    noise = np.maximum(*(local_noise(kept, line)[half:-half] for line in pose[:2]))
+    noise *= math.sqrt(2) / (2 * half * step)
     rates = (pose[:, 2 * half :] - pose[:, : -2 * half]) / (kept[2 * half :] - kept[: -2 * half])
     time, heading = kept[half:-half], pose[2, half:-half]
     cosine, sine = np.cos(heading), np.sin(heading)
     east, north, rate = rates
     vx, vy = cosine * east + sine * north, cosine * north - sine * east
-    return Track(time, east, north, vx, vy, rate, SPAN_OF_POSES)
+    return Track(time, east, north, vx, vy, rate, SPAN_OF_POSES, noise)
 
 
 # -------------------------------------------------------------------------------------------------
@@ -349,7 +395,10 @@ def hardest(run: Run) -> float:
 
 
 def collisions(run: Run, track: Track | None) -> Iterator[LogDefect]:
-    """Stretches whose mean acceleration over the track's span is beyond `hardest`."""
+    """Stretches whose mean acceleration over the track's span is beyond `hardest`.
+
+    `QUIET` deviations of that acceleration's noise are added to the limit.
+    """
     if track is None:
         return
     time = track.time
@@ -359,7 +408,10 @@ def collisions(run: Run, track: Track | None) -> Iterator[LogDefect]:
         *(values[step:] - values[:-step] for values in (track.east, track.north))
     ) / np.maximum(span, track.span)
     # Next to a gap or a jump of the poses, a change of velocity is no evidence.
-    hit = (change > hardest(run)) & (span < 1.5 * max(track.span, float(np.median(span))))
+    noise = track.noise[step:] * math.sqrt(2) / np.maximum(span, track.span)
+    hit = (change > hardest(run) + QUIET * noise) & (
+        span < 1.5 * max(track.span, float(np.median(span)))
+    )
     if run.truth is not None:
         for fault in jumps(run.truth):
             reach = track.span
@@ -376,7 +428,7 @@ def impacts(run: Run) -> Iterator[LogDefect]:
     if not np.array_equal(time, other) or not period(time) <= 1 / IMPACT_RATE:
         return
     ax, ay = ax - np.median(ax), ay - np.median(ay)
-    noise = 1.4826 * np.median(np.abs(np.diff([ax, ay]))) / math.sqrt(2)
+    noise = TO_DEVIATION * np.median(np.abs(np.diff([ax, ay]))) / math.sqrt(2)
     size = np.hypot(ax, ay)
     hit = size > hardest(run) + QUIET * noise
     yield from _merged_hits(time, time, size, hit, "the accelerometer reads")
@@ -491,8 +543,11 @@ def stuck_gyroscope(run: Run, track: Track | None) -> Iterator[LogDefect]:
 # -------------------------------------------------------------------------------------------------
 
 
-def refuse(run: Run) -> None:
-    """Raise `InputError` with file and time for errors that masking a stretch cannot remove."""
+def refuse(run: Run, car: Car | None = None) -> None:
+    """Raise `InputError` with file and time for errors that masking a stretch cannot remove.
+
+    `car` is the car of the log, if known. Its wheelbase tells how fast it turns.
+    """
     refuse_long(run)
     for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
         if table is not None:
@@ -514,9 +569,11 @@ def refuse(run: Run) -> None:
         np.abs(run.commands["steering"]) > STEEPEST,
         "steering_deg is beyond any lock",
     )
+    _refuse_two_clocks(run)
     if run.truth is not None:
         _refuse_truth(run, run.truth)
     _refuse_sensors(run)
+    _refuse_turning(run, run.car or car or Car())
 
 
 def _require_none(file: str, table: Table, wrong: np.ndarray, message: str) -> None:
@@ -532,11 +589,31 @@ def _refuse_table(file: str, table: Table) -> None:
     time = table["time_s"]
     _require_none(file, table, ~np.isfinite(time), "time_s is no number")
     _require_none(file, table, np.diff(time, prepend=time[0]) < 0, "time_s goes backwards")
-    if len(time) >= ROWS and np.median(np.diff(time)) >= SLOWEST_CLOCK:
-        step = float(np.median(np.diff(time)))
+    steps = np.diff(time)
+    if len(time) >= ROWS and np.median(steps) >= SLOWEST_CLOCK:
+        step = float(np.median(steps))
         raise InputError(
-            f"{file}, {time[0]:.2f} s: rows are {step:g} s apart: is time_s in milliseconds?"
+            f"{file}, {time[0]:.2f} s: rows are {step:g} s apart: {clock_mistake(time)}"
         )
+    if len(time) >= ROWS and np.mean(steps == 0) > REPEATED:
+        raise InputError(
+            f"{file}, {time[np.argmax(steps == 0)]:.2f} s: time_s stands still in "
+            f"{np.sum(steps == 0)} of {len(time)} rows with other values: give it more decimals"
+        )
+
+
+def _refuse_two_clocks(run: Run) -> None:
+    """Refuse tables whose times do not overlap with those of the commands."""
+    first, last = run.commands["time_s"][[0, -1]]
+    for name, table in (("telemetry", run.telemetry), ("truth", run.truth)):
+        if table is None or len(table) < ROWS:
+            continue
+        begin, end = table["time_s"][[0, -1]]
+        if begin > last + 1 or end < first:
+            raise InputError(
+                f"{run.path}/{name}.csv: goes from {begin:.2f} to {end:.2f} s, but commands.csv "
+                f"from {first:.2f} to {last:.2f} s: give both one clock"
+            )
 
 
 def _refuse_truth(run: Run, truth: Table) -> None:
@@ -603,6 +680,48 @@ def _refuse_sensors(run: Run) -> None:
             vx, vy = track.at(track.vx, time), track.at(track.vy, time)
             grips = (vx > 0.3) & (np.abs(vy) < 0.1 * vx)
             _refuse_other_units(file, name, time, values, vx, grips)
+
+
+def _refuse_turning(run: Run, car: Car) -> None:
+    """Refuse a yaw rate w that contradicts speed v, steering d and wheelbase L.
+
+    Within grip, w = v tan(d) / L. That holds within a factor of `COARSE` for any servo and for a
+    wheelbase that is only guessed. Rows count in which the car drives with its steering held.
+    """
+    time, rate = readings(run, "gyro_radps")
+    wheel_time, wheel = readings(run, "wheel_speed_mps")
+    if len(wheel) < TELLING:
+        return
+    speed = np.interp(time, wheel_time, wheel)
+    steering = asked(run, "steering", time - SERVO)
+    expected = speed * np.tan(np.clip(steering, -1.2, 1.2)) / float(car.body.wheelbase)
+    steady = np.abs(steering - asked(run, "steering", time)) < 0.5 * np.abs(steering)
+    usable = (speed > SLOW) & steady & (np.abs(rate) > 0)
+    file = f"{run.path}/telemetry.csv"
+    largest = float(np.max(np.abs(run.commands["steering"])))
+    turns = usable & (np.abs(steering) > STEERED)
+    found = _ratio(rate, expected, turns)
+    if found and DEGREES[0] / COARSE < found[0] and found[1] < DEGREES[1] * COARSE:
+        at = float(time[np.argmax(turns)])
+        raise InputError(
+            f"{file}, {at:.2f} s: gyro_radps is some {np.mean(found):.0f} times what speed, "
+            f"steering and wheelbase allow: in degrees? {DECLARE_DEGREES}"
+        )
+    # In a drift the front wheels point the other way. A car that hardly turns does not drift.
+    gentle = turns & (speed * np.abs(rate) < GENTLE)
+    found = _ratio(rate, expected, gentle)
+    if found and found[0] > -COARSE and found[1] < -1 / COARSE:
+        at = float(time[np.argmax(gentle)])
+        raise InputError(
+            f"{file}, {at:.2f} s: gyro_radps and steering_deg have opposite signs: both are "
+            "positive to the left"
+        )
+    found = _ratio(rate, expected, usable & (steering != 0))
+    if largest < LEAST_LOCK and found and found[0] > DEGREES[0] / COARSE:
+        raise InputError(
+            f"{run.path}/commands.csv: steering_deg stays within {math.degrees(largest):.2f}, but "
+            f"the car turns {np.mean(found):.0f} times as fast: is it in radians?"
+        )
 
 
 def _ratio(values: np.ndarray, true: np.ndarray, usable: np.ndarray) -> tuple[float, float] | None:

@@ -22,6 +22,9 @@ SPEED_COMMANDS = ("time_s", "speed_mps", "steering_deg")  # of a car with a spee
 LARGEST_STEERING = 90.0  # degrees
 FASTEST = 100.0  # m/s, of a commanded speed
 LATEST = 1e6  # s, of a time; a clock of Unix time is beyond
+CLOCKS = {"seconds": 1.0, "milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+SLOWEST_CLOCK = 0.5  # s between rows; nothing that a car logs is so slow
+UNIX = (4e8, 4e9)  # s; a clock in this range counts from 1970
 LONGEST = 3600.0  # s, of what is simulated on the commands of a log
 LARGEST = 1e20  # of a finite cell of a run; sums of squares of larger ones leave the floats
 MOST_COLUMNS = 10_000
@@ -102,12 +105,56 @@ def _read_table(
             line, first = _first(np.abs(time) > latest), time[np.argmax(np.abs(time) > latest)]
             raise InputError(
                 f"{path}, line {line}: time_s must be within {latest:g} s of 0, not {first:.10g}: "
-                "if it is Unix time, 'countersteer import run' moves the clock of all tables to 0"
+                f"{clock_mistake(time)}"
             )
         if np.any(np.diff(time) < 0):
             line = _first(np.diff(time) < 0) + 1
             raise InputError(f"{path}, line {line}: time_s goes backwards")
     return table
+
+
+def clock_mistake(time: np.ndarray) -> str:
+    """What a clock seems to count, if not seconds from 0, and what to do about it."""
+    begins = "'countersteer import run' moves the clock of all its tables to 0"
+    first = abs(float(time[0]))
+    for unit, factor in CLOCKS.items():
+        if UNIX[0] <= first / factor <= UNIX[1]:
+            convert = "" if factor == 1 else f", in {unit}: convert it to seconds, and"
+            return f"it seems to be Unix time{convert or ':'} {begins}"
+    steps = np.diff(time)
+    step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    for unit, factor in CLOCKS.items():
+        if step / factor < SLOWEST_CLOCK:
+            return begins if factor == 1 else f"is it in {unit}? Convert it to seconds"
+    return begins
+
+
+def merged_rows(table: Table) -> Table:
+    """The table with rows of one time merged, where they fill different columns or agree.
+
+    A log that is written topic by topic has such rows. Rows that contradict each other stay.
+    """
+    time = table["time_s"]
+    if not np.any(np.diff(time) == 0):
+        return table
+    group = np.cumsum(np.diff(time, prepend=time[:1]) > 0)
+    count = int(group[-1]) + 1
+    conflict = np.zeros(count, bool)
+    filled = {}
+    for name, values in table.items():
+        there = np.flatnonzero(~np.isnan(values))
+        groups, first = np.unique(group[there], return_index=True)
+        whole = np.full(count, math.nan)
+        whole[groups] = values[there[first]]
+        conflict[group[there[values[there] != whole[group[there]]]]] = True
+        filled[name] = whole[group]
+    kept = conflict[group] | (np.diff(group, prepend=-1) > 0)
+    return Table(
+        {
+            name: np.where(conflict[group], values, filled[name])[kept]
+            for name, values in table.items()
+        }
+    )
 
 
 def _cells(path: Path, lines: list[str]) -> Iterator[list[str]]:
@@ -126,9 +173,10 @@ def _first(where: np.ndarray) -> int:
 def read_measurements(
     path: Path, required: Iterable[str], recorded: bool = False, any_clock: bool = False
 ) -> Table:
-    """Read a table of a run. Raises `InputError` for a finite number beyond `LARGEST` too.
+    """Read a table of a run, with `merged_rows`.
 
-    `recorded` and `any_clock` are as in `read_table`.
+    Raises `InputError` for a finite number beyond `LARGEST` too. `recorded` and `any_clock` are as
+    in `read_table`.
     """
     table = read_table(path, required, (), recorded, any_clock)
     for name, column in table.items():
@@ -138,7 +186,7 @@ def read_measurements(
                 f"{path}, line {_first(beyond)}: {short(name)} must be in "
                 f"[-{LARGEST:g}, {LARGEST:g}], not {column[np.argmax(beyond)]:g}"
             )
-    return table
+    return merged_rows(table)
 
 
 def read_commands(path: Path, recorded: bool = False, any_clock: bool = False) -> Table:

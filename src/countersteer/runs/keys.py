@@ -5,6 +5,7 @@ passed over. A key may be absent, but a table that names `all_of` keys has to ho
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -17,6 +18,9 @@ Check = Callable[[Any, str], object]  # of a value, with its file and key; raise
 
 FARTHEST, FASTEST = 1e6, 1e4  # m (also rad); m/s and rad/s
 LONGEST_TEXT = 1000  # characters
+ENCODER_ON = ("shaft", "front-left", "front-right", "rear-left", "rear-right")
+GYRO_UNITS = {"rad/s": 1.0, "deg/s": math.pi / 180}
+VOLT_UNITS = {"V": 1.0, "mV": 1e-3}
 
 
 def _number(low: float, high: float) -> Check:
@@ -83,6 +87,7 @@ class Keys:
 _PLACE = {key: _number(-FARTHEST, FARTHEST) for key in ("x_m", "y_m", "heading_rad")}
 _POSE = Keys(_PLACE, tuple(_PLACE))
 _DISTANCE, _LAG = _number(-FARTHEST, FARTHEST), _number(0, 10)
+_ARM = _number(-5, 5)  # m, within a car
 _POINT = _list(_DISTANCE, 2)
 _WAVE = {key: _number(-FARTHEST, FARTHEST) for key in ("x_radpm", "y_radpm", "phase_rad")}
 
@@ -120,6 +125,7 @@ ABOUT = Keys(
         "laps": _whole(1, 1000),
         "precision_bits": _one_of(32, 64),
         "battery_charge": _number(0, 1),
+        "battery_charge_end": _number(0, 1),
         "velocity_lag_s": _number(-10, 10),
         "line_spacing_m": _number(1e-6, FARTHEST),
         "start": _POSE,
@@ -128,8 +134,25 @@ ABOUT = Keys(
         ),
         "sensors": Keys(
             {
-                "encoder": Keys({"lag_s": _LAG, "over_s": _LAG, "step_mps": _number(0, FASTEST)}),
-                "gyroscope": Keys({"lag_s": _LAG}),
+                "encoder": Keys(
+                    {
+                        "on": _one_of(*ENCODER_ON),
+                        "lag_s": _LAG,
+                        "over_s": _LAG,
+                        "step_mps": _number(0, FASTEST),
+                        "regions": _number(1, 10_000),
+                    }
+                ),
+                "gyroscope": Keys({"lag_s": _LAG, "unit": _one_of(*GYRO_UNITS)}),
+                "capture": Keys({"x_m": _ARM, "y_m": _ARM, "yaw_offset_deg": _number(-180, 180)}),
+                "voltmeter": Keys(
+                    {
+                        "lag_s": _LAG,
+                        "noise_v": _number(0, 10),
+                        "unit": _one_of(*VOLT_UNITS),
+                        "cells": _whole(1, 100),
+                    }
+                ),
             }
         ),
         "link": Keys({"name": _text}),

@@ -12,8 +12,10 @@ from countersteer.car.files import car_from_tables, library, load_car
 from countersteer.errors import InputError
 from countersteer.reading.content import read_text, reading
 from countersteer.reading.documents import json_object, toml
+from countersteer.runs.declared import telemetry_in_si, truth_at_centre
 from countersteer.runs.files import (
     LONGEST,
+    SLOWEST_CLOCK,
     Table,
     drive_column,
     read_commands,
@@ -79,15 +81,20 @@ def refuse_uncontrolled(commands: Iterable[str], car: Car, where: str) -> None:
 
 
 def refuse_long(run: Run) -> None:
-    """Raise `InputError` for a run of over `LONGEST`, which would be simulated at each instant."""
+    """Raise `InputError` for a run that goes on beyond `LONGEST`.
+
+    Each instant from 0 on would be simulated.
+    """
     for name, table in (
         ("commands", run.commands), ("telemetry", run.telemetry), ("truth", run.truth),
     ):  # fmt: skip
         if table is not None and len(table) and table["time_s"][-1] > LONGEST:
-            last = f"{table['time_s'][-1]:g} s, over {LONGEST:g} s"
+            first, last = float(table["time_s"][0]), float(table["time_s"][-1])
+            advice = "convert milliseconds, or cut the log into pieces"
+            if last - first <= min(LONGEST, SLOWEST_CLOCK * len(table)):
+                advice = f"subtract the {first:g} s at which it begins from all the log's tables"
             raise InputError(
-                f"{run.path}/{name}.csv: goes on to {last}: convert "
-                "milliseconds, or cut the log into pieces"
+                f"{run.path}/{name}.csv: goes on to {last:g} s, over {LONGEST:g} s: {advice}"
             )
 
 
@@ -121,12 +128,16 @@ def read_run(path: Path) -> Run:
 def _read(path: Path) -> Run:
     recorded = (path / "run.mcap").exists()  # no table that was written by hand
     telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
+    about = read_about(path / "run.toml")
+    pose = ("time_s", "x_m", "y_m", "heading_rad")
     return Run(
         path,
-        read_about(path / "run.toml"),
+        about,
         read_commands(path / "commands.csv", recorded),
-        read_measurements(telemetry, ("time_s",), recorded) if telemetry.exists() else None,
-        read_measurements(truth, ("time_s", "x_m", "y_m", "heading_rad"), recorded)
+        telemetry_in_si(about, read_measurements(telemetry, ("time_s",), recorded))
+        if telemetry.exists()
+        else None,
+        truth_at_centre(about, read_measurements(truth, pose, recorded))
         if truth.exists()
         else None,
         read_summary(summary) if summary.exists() else {},

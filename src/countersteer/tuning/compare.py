@@ -7,8 +7,8 @@ simulated run. Without both, it is the logged encoder and gyroscope. They are co
 simulated sensors of the same lag and quantum.
 
 Logs seldom state the battery charge, and a nearly empty pack turns the wheels a fifth slower. If
-`run.toml` does not state it, one charge for the whole log is fitted to the windows
-(`agreeing_charge`). The errors with a full battery are given too.
+neither `run.toml` nor the log's voltmeter tells it, one charge for the whole log is fitted to the
+windows (`agreeing_charge`). The errors with a full battery are given too.
 
 A steady drift is predicted well by persistence, the prediction that nothing changes. So the same
 errors are given for `persistence`. All errors are repeated for windows in which something changes
@@ -26,11 +26,14 @@ from scipy.optimize import minimize_scalar
 
 from countersteer.car.car import Car
 from countersteer.errors import InputError
+from countersteer.runs import defects
 from countersteer.runs.run import Run
 from countersteer.tuning import fit
+from countersteer.tuning.log_sensors import resolve
 from countersteer.tuning.windows import (
     CHANGES,
     EARLY,
+    MEAN,
     QUANTITIES,
     SLOWEST,
     Measured,
@@ -40,6 +43,7 @@ from countersteer.tuning.windows import (
     simulate,
     speed_at,
     states_at,
+    why_no_window,
     window_starts,
 )
 
@@ -76,12 +80,18 @@ def compare(
     without a reference are dropped. Raises `InputError` if none is left.
 
     Three assumptions replace what a log lacks. There was no command before the first one. The
-    servo follows the car's own law. The battery has the charge of `run.toml`, or else the one that
-    agrees best; then `as_if_full` has the errors with a full battery.
+    servo follows the car's own law. The battery has the charge of `run.toml` or of the voltmeter,
+    or else the one that agrees best; then `as_if_full` has the errors with a full battery.
+
+    `sensors` has what the log tells of its sensors, and `warnings` a line for each doubt.
     """
     if horizon is not None and not dt <= horizon < math.inf:
         raise InputError(f"--horizon {horizon:g}: give at least a step of {dt:g} s, or run")
     car = jax.tree.map(np.float64, car)
+    defects.refuse(run, car)
+    run, repairs = defects.repair(run)
+    sensors = resolve(run, car, dt)
+    run = sensors.run
     measured = read_measured(run, car)
     commands = run.commands
     if horizon is None:
@@ -95,10 +105,7 @@ def compare(
         ticks = max(1, round(horizon / dt))
         starts, resting = window_starts(measured, commands, ticks, dt)
     if len(starts) == 0:
-        raise InputError(
-            f"{run.path}: no window of {ticks * dt:g} s in which the dead-man switch is closed and "
-            f"the car starts at {SLOWEST:g} m/s or more, or from rest with a throttle onset"
-        )
+        raise InputError(why_no_window(run, measured, ticks * dt))
     known = "battery_charge" in run.about
     full = {**run.about, "battery_charge": fit.FULL}
     run = run if known else dataclasses.replace(run, about=full)
@@ -107,8 +114,9 @@ def compare(
     windows, kept = simulation.windows()
     if not windows:
         raise InputError(
-            f"{run.path}: no window of {ticks * dt:g} s has a whole reference: motion capture, or "
-            "wheel_speed_mps and gyro_radps in telemetry.csv"
+            f"{run.path}: no window of {ticks * dt:g} s has a whole reference: "
+            + " and ".join(simulation.references or ("motion capture",))
+            + " are known in none throughout"
         )
     charge, as_if_full = float(run.about["battery_charge"]), {}
     if not known:
@@ -122,10 +130,13 @@ def compare(
         "horizon_s": round(ticks * dt, 9),
         "battery_charge": charge,
         "battery_known": known,
+        "battery_from": sensors.charge_from or "fit",
         **scores(windows),
         **as_if_full,
         "transient": {"windows": len(lively), **scores(lively)},
         "sliding": {"windows": len(sliding), **scores(sliding)},
+        "sensors": sensors.as_json(),
+        "warnings": [*repairs, *sensors.warnings],
     }
     series_of_all = {
         "title": run.path.name,
@@ -156,6 +167,8 @@ class Simulation:
         """`starts` are ticks, and a window has `ticks` of them. See `compared` for `whole`."""
         self.car, self.commands, self.ticks, self.dt = car, run.commands, ticks, dt
         self.references, self.whole = find_references(measured), whole
+        wheel = self.references.get("wheel_speed_mps")
+        self.sees = MEAN if wheel is None else wheel.sees
         with jax.enable_x64(True):
             states = states_at(run, car, measured, starts, resting, dt)
         known = np.isfinite(states.motion.vx + states.motion.vy + states.motion.yaw_rate)
@@ -171,7 +184,9 @@ class Simulation:
             motion = states.motion
             states = states._replace(motion=motion._replace(charge=0 * motion.charge + charge))
         with jax.enable_x64(True):
-            predicted = simulate(self.car, states, self.commands, self.starts, self.ticks, dt)
+            predicted = simulate(
+                self.car, states, self.commands, self.starts, self.ticks, dt, self.sees
+            )
         found: list[Window] = []
         kept = []
         for i, start in enumerate(self.starts.tolist()):

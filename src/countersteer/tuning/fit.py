@@ -36,7 +36,7 @@ from countersteer.runs.run import Run
 from countersteer.signals import Array, SpeedCommand
 from countersteer.tuning import shooting
 from countersteer.tuning.shooting import Shots
-from countersteer.tuning.windows import QUANTITIES
+from countersteer.tuning.windows import QUANTITIES, read_measured, why_no_window
 
 STEP = 0.002  # s, of the simulation; its error is then 1 % of the measurement's
 HORIZON = 1.0  # s, length of a window
@@ -229,10 +229,12 @@ def take_shots(
     unknown (NaN) in them. Raises `InputError` if no window is left.
     """
     names = list(cars)
-    parts, starts = [], []
+    parts, starts, reasons = [], [], []
     for i, (run, surface) in enumerate(zip(runs, surfaces, strict=True)):
         found = shooting.take(run, cars[surface], i, names.index(surface), HORIZON, every, STEP)
         if found is None:
+            measured = read_measured(run, cars[surface])
+            reasons.append(why_no_window(run, measured, HORIZON))
             continue
         shots, start = found
         clean = np.full(len(start), True)
@@ -242,10 +244,14 @@ def take_shots(
                 shots = without(shots, fault.column, touched)
             else:
                 clean &= ~touched
+        if not clean.any():
+            whole = [fault.what for fault in faults[i] if not fault.column]
+            reasons.append(f"{run.path}: all windows are left out: {whole[0]}")
         parts.append(select(shots, clean))
         starts.append(start[clean])
-    if not parts or not sum(len(part.surface) for part in parts):
-        raise InputError("no run holds a window of 1 s that can be fitted: driven, and measured")
+    if not sum(len(part.surface) for part in parts):
+        more = f" (and {len(reasons) - 1} runs more)" if len(reasons) > 1 else ""
+        raise InputError(f"{reasons[0]}{more}")
     return shooting.joined(parts), np.concatenate(starts)
 
 

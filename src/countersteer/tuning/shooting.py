@@ -44,7 +44,8 @@ class Shots(NamedTuple):
     surface: Array  # index of the surface
     velocity: Vector  # at the start, of the centre of mass in the body's axes
     acceleration: tuple[Array, Array]  # at the start, forward and left; sets the wheel loads
-    wheel_speed: Array  # mean rim speed; NaN: wheels roll
+    wheel_speed: Array  # that the encoder sees; NaN: wheels roll
+    sees: Wheels  # share of each wheel in it
     rims: Wheels  # rim speeds; NaN: not known for each wheel
     charge: Array  # of the battery; NaN: not stated by the log
     commands: AnyCommand  # (windows, ticks from `BEFORE` on)
@@ -84,7 +85,9 @@ def take(
     if len(starts) == 0:
         return None
     time = starts * dt
-    vx, vy, yaw_rate, ax, ay = body_at(measured, time, resting)
+    whole = asked(run.commands, np.arange(int(starts.max()) + 1), dt)
+    angle = windows.actuators(car, *whole, dt)[0][starts]
+    vx, vy, yaw_rate, ax, ay = body_at(car, measured, angle, time, resting)
     references = find_references(measured)
     after = time[:, None] + SAMPLE * np.arange(1, round(horizon / SAMPLE) + 1)
     seen = []
@@ -97,6 +100,7 @@ def take(
     wheels = references.get("wheel_speed_mps")
     nothing = np.full(len(starts), np.nan)
     mean = nothing if wheels is None else wheels.undone(time, resting)
+    sees = windows.MEAN if wheels is None else wheels.sees
     rims = (
         Wheels(*(signal.at(time) for signal in measured.wheels))
         if measured.wheels is not None
@@ -113,8 +117,9 @@ def take(
         Vector(vx, vy, yaw_rate),
         (ax, ay),
         mean,
+        Wheels(*(np.full(len(starts), share) for share in sees)),
         rims,
-        np.full(len(starts), float(run.about.get("battery_charge", math.nan))),
+        windows.charges(run, time, math.nan),
         commands,
         rims_before,
         np.stack(seen, axis=1),
@@ -142,18 +147,18 @@ def predict(car: Car, shot: Shots, dt: float) -> Array:
         ahead,
         every,
         dt,
-        lambda state: quantities_of(car, state.motion),
+        lambda state: quantities_of(car, state.motion, shot.sees),
     )
     vx, vy, yaw_rate, rims = seen
     # An encoder counts over two samples. The one before the window equals the one at its start.
-    line = jnp.concatenate([quantities_of(car, motion)[3][None], rims, rims[-1:]])
+    line = jnp.concatenate([quantities_of(car, motion, shot.sees)[3][None], rims, rims[-1:]])
     counted = (line[:-2] + 2 * line[1:-1] + line[2:]) / 4
     return jnp.stack([vx, vy, yaw_rate, counted])
 
 
 def _start(car: Car, shot: Shots, angle: Scalar, duty: Scalar) -> Motion:
     """The state at a window's start from the measured quantities. The pose is 0."""
-    rims = rolling(car, shot.velocity, angle, shot.wheel_speed)
+    rims = rolling(car, shot.velocity, angle, shot.wheel_speed, shot.sees)
     wheels = Wheels(
         *(
             jnp.where(jnp.isnan(known), rim, known) / radius

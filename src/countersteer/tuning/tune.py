@@ -17,6 +17,7 @@ from countersteer.runs.run import Run
 from countersteer.text import toml_of
 from countersteer.tuning import fit, shooting
 from countersteer.tuning.fit import FLOOR, Fitted, Result
+from countersteer.tuning.log_sensors import LogSensors, resolve
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import CHANGES, QUANTITIES
 
@@ -30,6 +31,7 @@ class Logs(NamedTuple):
     masked: list[str]  # a line for each repair and each stretch left out
     shots: Shots
     start: np.ndarray
+    sensors: list[LogSensors]  # of each run
 
     @property
     def run(self) -> np.ndarray:
@@ -53,6 +55,7 @@ class Logs(NamedTuple):
             self.masked + other.masked,
             shooting.joined([self.shots, after]),
             np.concatenate([self.start, other.start]),
+            self.sensors + other.sensors,
         )
 
 
@@ -61,18 +64,20 @@ def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: 
 
     `every` (s) is the time between two starts. Raises `InputError` if a run is unusable.
     """
-    clean, masks, words = [], [], []
+    clean, sensors, masks, words = [], [], [], []
     for run in runs:
-        refuse(run)
+        car = cars[surface_of(run, cars, base)]
+        refuse(run, car)
         mended, repairs = repair(run)
         found = find_defects(mended)
-        clean.append(mended)
+        sensors.append(resolve(mended, car, fit.STEP))
+        clean.append(sensors[-1].run)
         masks.append(found)
         words += [f"{run.path.name}: {line}" for line in repairs]
         words += [_defect_line(run, defect) for defect in found]
     surfaces = [surface_of(run, cars, base) for run in clean]
     shots, start = fit.take_shots(clean, dict(cars), surfaces, masks, every)
-    return Logs(clean, words, shots, start)
+    return Logs(clean, words, shots, start, sensors)
 
 
 def _defect_line(run: Run, defect: LogDefect) -> str:
@@ -154,6 +159,7 @@ def tune(
                     "kind": title,
                     "battery_charge": float(shots.charge[0]),
                     "battery_known": "battery_charge" in run.about,
+                    "battery_from": part.sensors[i].charge_from or "fit",
                 }
                 runs.append(entry | judged(result.cars, shots))
     about: dict[str, Any] = {
@@ -166,6 +172,10 @@ def tune(
         "runs": runs,
         "totals": totals,
         "masked": logs.masked,
+        "sensors": {
+            run.path.name: {"estimates": of.as_json(), "warnings": of.warnings}
+            for run, of in zip(logs.runs, logs.sensors, strict=True)
+        },
         "evaluations": result.evaluations,
         "cost": result.cost,
     }

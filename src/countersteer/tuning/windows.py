@@ -16,8 +16,10 @@ from scipy.signal import savgol_filter
 
 from countersteer.car.car import Car
 from countersteer.errors import InputError
+from countersteer.runs.declared import sensor_tables
 from countersteer.runs.defects import stretches
 from countersteer.runs.files import Table, drive_column
+from countersteer.runs.keys import ENCODER_ON
 from countersteer.runs.run import Run, refuse_long, refuse_uncontrolled
 from countersteer.signals import AnyCommand, Command, Motion, Scalar, SpeedCommand, Wheels
 from countersteer.world import planar, servo, speed_controller
@@ -33,6 +35,8 @@ SLOWEST = 0.2  # m/s, least speed at the start of a window
 SMOOTHED_OVER, DEGREE = 0.15, 3  # s, width of the Savitzky-Golay filter, and its degree
 MOST_POSES = 10_000_000  # after resampling
 GAP = 0.035  # s; longer gaps of motion capture are not interpolated
+
+MEAN = Wheels(0.25, 0.25, 0.25, 0.25)  # share of each wheel in their mean
 
 PIECE = 100  # ticks in each call of the compiled program, for any horizon
 SIZES = (1, 32, 256)  # windows simulated at once; few sizes, as each compiles its own program
@@ -73,6 +77,7 @@ class Measured(NamedTuple):
     gyro: Signal | None
     gyro_timing: Timing
     armed: Signal | None  # dead-man switch, held between its reports; None: always closed
+    encoder_sees: Wheels = MEAN  # share of each wheel in the encoder's speed
 
 
 class Reference(NamedTuple):
@@ -80,6 +85,7 @@ class Reference(NamedTuple):
 
     signal: Signal
     timing: Timing | None = None  # None: a state
+    sees: Wheels = MEAN  # of a wheel speed: share of each wheel in it
 
     def undone(self, time: np.ndarray, resting: np.ndarray | bool = False) -> np.ndarray:
         """The quantity at these times, without the sensor's lag.
@@ -133,6 +139,7 @@ def read_measured(run: Run, car: Car) -> Measured:
         _reported(telemetry, "gyro_radps"),
         gyro_timing(run),
         _reported(telemetry, "armed"),
+        encoder_sees(run, car),
     )
 
 
@@ -141,26 +148,43 @@ def _known(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, math.nan)
 
 
-def encoder_timing(run: Run, car: Car) -> Timing:
-    """The encoder's timing, from `[sensors.encoder]` of the run, else from the car's declaration.
+def encoder_on(run: Run, car: Car) -> str:
+    """Where the encoder sits: by `[sensors.encoder]` of the run, by the run's own car, or `car`."""
+    own = run.car or car
+    return str(sensor_tables(run.about, "encoder").get("on", own.sensors.encoder.on))
 
-    The car's encoder counts regions over its update time. So a reading lags by half of it.
+
+def encoder_sees(run: Run, car: Car) -> Wheels:
+    """The share of each wheel in the encoder's speed."""
+    return shares(encoder_on(run, car), car)
+
+
+def shares(on: str, car: Car) -> Wheels:
+    """The share of each wheel in what an encoder sees there; the shaft's is of driven wheels."""
+    if on != "shaft":
+        return Wheels(*(float(on == place) for place in ENCODER_ON[1:]))
+    front = float(car.drivetrain.front_share) / 2
+    return Wheels(front, front, 0.5 - front, 0.5 - front)
+
+
+def encoder_timing(run: Run, car: Car) -> Timing:
+    """The encoder's timing, from `[sensors.encoder]` of the run, else as its car declares it.
+
+    The car is the run's own, or else `car`. Its encoder counts regions over its update time. So a
+    reading lags by half of it.
     """
-    part = car.sensors.encoder
-    over = float(part.update)
-    tire = car.tires.rear if "rear" in part.on else car.tires.front
-    declared = {
-        "lag_s": over / 2,
-        "over_s": over,
-        "step_mps": math.pi * float(tire.radius) / float(part.regions) / over,
-    }
-    known = declared | run.about.get("sensors", {}).get("encoder", {})
-    return Timing(known["lag_s"], known["over_s"], known["step_mps"])
+    declared = sensor_tables(run.about, "encoder")
+    part = (run.car or car).sensors.encoder
+    over = float(declared.get("over_s", part.update))
+    tire = car.tires.rear if "rear" in encoder_on(run, car) else car.tires.front
+    regions = float(declared.get("regions", part.regions))
+    step = math.pi * float(tire.radius) / regions / over if over else 0.0
+    return Timing(declared.get("lag_s", over / 2), over, declared.get("step_mps", step))
 
 
 def gyro_timing(run: Run) -> Timing:
     """The gyroscope's timing, from `[sensors.gyroscope]` of the run, else without a lag."""
-    return Timing(run.about.get("sensors", {}).get("gyroscope", {}).get("lag_s", 0.0))
+    return Timing(sensor_tables(run.about, "gyroscope").get("lag_s", 0.0))
 
 
 def _reported(table: Table, name: str) -> Signal | None:
@@ -225,7 +249,9 @@ def find_references(measured: Measured) -> dict[str, Reference]:
         mean = np.mean([wheel.value for wheel in measured.wheels], axis=0)
         found["wheel_speed_mps"] = Reference(Signal(measured.wheels[0].time, mean))
     elif measured.encoder is not None:
-        found["wheel_speed_mps"] = Reference(measured.encoder, measured.encoder_timing)
+        found["wheel_speed_mps"] = Reference(
+            measured.encoder, measured.encoder_timing, measured.encoder_sees
+        )
     return found
 
 
@@ -266,6 +292,33 @@ def _closed(armed: Signal | None, begin: np.ndarray, end: np.ndarray) -> np.ndar
     return (first >= 0) & (opened[beyond] == opened[np.maximum(first, 0)])
 
 
+def why_no_window(run: Run, measured: Measured, horizon: float) -> str:
+    """Why a run has no window of `horizon` seconds."""
+    where = f"{run.path}: no window of {horizon:g} s: "
+    if measured.vx is None and "wheel_speed_mps" not in find_references(measured):
+        there = "truth.csv" if run.truth is not None else "telemetry.csv"
+        empty = run.telemetry is not None and "wheel_speed_mps" in run.telemetry
+        cause = "is empty" if empty else "is missing"
+        return f"{where}it has no speed signal: wheel_speed_mps {cause} in telemetry.csv, and " + (
+            "truth.csv holds no poses" if there == "truth.csv" else "there is no truth.csv"
+        )
+    time = run.commands["time_s"]
+    if time[-1] - time[0] < horizon:
+        return f"{where}its commands last {time[-1] - time[0]:.3g} s"
+    if measured.armed is not None and not np.any(measured.armed.value >= 0.5):
+        return f"{where}the dead-man switch is never closed (armed in telemetry.csv)"
+    every = np.arange(time[0], time[-1], 0.05)
+    speed = speed_at(measured, every, False)
+    if not np.any(np.isfinite(speed)):
+        return f"{where}its speed is not known while it has commands: do the clocks agree?"
+    if np.nanmax(speed) < SLOWEST:
+        return f"{where}its speed stays below {SLOWEST:g} m/s (at most {np.nanmax(speed):.2g})"
+    return (
+        f"{where}in none is the dead-man switch closed and the car at {SLOWEST:g} m/s or more, or "
+        "at rest with a throttle onset"
+    )
+
+
 # -------------------------------------------------------------------------------------------------
 # Simulation
 # -------------------------------------------------------------------------------------------------
@@ -276,8 +329,9 @@ def states_at(
 ) -> State:
     """The car's states at the starts of windows; the leaves have a leading axis of windows.
 
-    A velocity that was not measured is NaN. The mean speed of the four wheels is the encoder's.
-    They differ as their hubs' speeds do. Without an encoder they roll.
+    A velocity that was not measured is NaN. The wheel with the encoder has its speed (on the shaft,
+    the driven wheels have it on average). The wheels differ as their hubs' speeds do. Without an
+    encoder they roll.
     """
     time = starts * dt
     ticks = np.arange(int(starts.max()) + 1)
@@ -285,9 +339,9 @@ def states_at(
     rims = rims_at(measured, ticks * dt) if isinstance(commands, SpeedCommand) else None
     angle, duty = (trace[starts] for trace in actuators(car, commands, rims, dt))
     zero = np.zeros(len(time))
-    vx, vy, yaw_rate, ax, ay = body_at(measured, time, resting)
+    vx, vy, yaw_rate, ax, ay = body_at(car, measured, angle, time, resting)
     wheels = wheels_at(car, measured, Vector(vx, vy, yaw_rate), angle, time, resting)
-    charge = zero + float(run.about.get("battery_charge", 1.0))
+    charge = charges(run, time, 1.0)
     motion = Motion(zero, zero, zero, vx, vy, yaw_rate, wheels, angle, duty, ax, ay, charge)
     slots = planar.delay_slots(car, dt)
     # A window's count starts at 0, so its slot s holds the command of the tick s - slots.
@@ -307,10 +361,25 @@ def rims_at(measured: Measured, time: np.ndarray) -> np.ndarray:
     return np.interp(time + lag, *signal) if np.any(known) else np.zeros_like(time)
 
 
-def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[np.ndarray, ...]:
+def charges(run: Run, time: np.ndarray, unknown: float) -> np.ndarray:
+    """The battery's charge at these times as the run states it, else `unknown`.
+
+    `battery_charge` is that of its first command. It falls evenly to `battery_charge_end`.
+    """
+    begin = float(run.about.get("battery_charge", unknown))
+    end = float(run.about.get("battery_charge_end", begin))
+    first, last = run.commands["time_s"][[0, -1]]
+    return np.interp(time, [first, max(last, first + EARLY)], [begin, end])
+
+
+def body_at(
+    car: Car, measured: Measured, angle: np.ndarray, time: np.ndarray, resting: np.ndarray
+) -> tuple[np.ndarray, ...]:
     """Velocity, yaw rate and acceleration of the centre of mass at these times, in the body's axes.
 
-    Without motion capture, the forward velocity is the encoder's and the lateral velocity is 0.
+    Without motion capture, the lateral velocity is 0, and the forward velocity is the one at which
+    the encoder's wheel rolls as fast as it reads. `angle` is that of the steering (rad). Without a
+    gyroscope, the car turns as its front wheels point.
     """
     if measured.vx is not None and measured.vy is not None and measured.yaw_rate is not None:
         vx, vy, yaw_rate = (
@@ -320,10 +389,14 @@ def body_at(measured: Measured, time: np.ndarray, resting: np.ndarray) -> tuple[
         ax, ay = change_x - yaw_rate * vy, change_y + yaw_rate * vx
         return vx, vy, yaw_rate, np.nan_to_num(ax), np.nan_to_num(ay)
     references = find_references(measured)
-    vx, yaw_rate = (
-        references[name].undone(time, resting) if name in references else np.zeros(len(time))
-        for name in ("wheel_speed_mps", "yaw_rate_radps")
-    )
+    wheel, gyro = (references.get(name) for name in ("wheel_speed_mps", "yaw_rate_radps"))
+    speed = np.zeros(len(time)) if wheel is None else wheel.undone(time, resting)
+    bend = np.tan(angle) / float(car.body.wheelbase)
+    yaw_rate = speed * bend if gyro is None else gyro.undone(time, resting)
+    vx = speed
+    if wheel is not None:
+        roll = seen_by(wheel.sees, rolls(car, angle))
+        vx = (speed - np.asarray(roll.yaw) * yaw_rate) / np.asarray(roll.x)
     return vx, 0.0 * vx, yaw_rate, 0.0 * vx, yaw_rate * vx
 
 
@@ -349,21 +422,49 @@ def wheels_at(
     else:
         reference = find_references(measured).get("wheel_speed_mps")
         nothing = np.full(len(time), math.nan)
-        mean = nothing if reference is None else reference.undone(time, resting)
-        rims = rolling(car, velocity, steering, mean)
+        speed = nothing if reference is None else reference.undone(time, resting)
+        sees = MEAN if reference is None else reference.sees
+        rims = rolling(car, velocity, steering, speed, sees)
     return Wheels(*(rim / radius for rim, radius in zip(rims, radii(car), strict=True)))
 
 
-def rolling(car: Car, velocity: Vector, steering: Scalar, mean: Scalar) -> tuple[Scalar, ...]:
-    """Rim speeds of the four wheels (m/s) with the given mean. They differ as their hubs' speeds.
-
-    Where the mean is NaN, the wheels roll.
-    """
+def rolls(car: Car, steering: Scalar) -> Wheels:
+    """The direction of each wheel's hub speed: its dot product with a velocity (m/s)."""
     steered = planar.Steered(*servo.directions(car.body, car.servo, steering))
-    rolls, _ = planar.contact_directions(car, steered)
-    hubs = [dot(roll, velocity) for roll in rolls]
-    slip = jnp.nan_to_num(mean - sum(hubs) / 4)
-    return tuple(hub + slip for hub in hubs)
+    return planar.contact_directions(car, steered)[0]
+
+
+def seen_by(sees: Wheels, directions: Wheels) -> Vector:
+    """The direction of the hub speed that an encoder sees."""
+    return Vector(
+        *(
+            sum(share * part for share, part in zip(sees, parts, strict=True))
+            for parts in zip(*directions, strict=True)
+        )
+    )
+
+
+def rolling(
+    car: Car, velocity: Vector, steering: Scalar, seen: Scalar, sees: Wheels
+) -> tuple[Scalar, ...]:
+    """Rim speeds of the four wheels (m/s), of which an encoder that `sees` them reads `seen`.
+
+    What `seen` exceeds the hubs' speed by is slip. The driven wheels share it. If the encoder is
+    on a wheel that is not driven, only its axle has it. Where `seen` is NaN, the wheels roll.
+    """
+    hubs = [dot(roll, velocity) for roll in rolls(car, steering)]
+    shares = list(zip(sees, hubs, strict=True))
+    slip = jnp.nan_to_num(seen - sum(share * hub for share, hub in shares))
+    drive = car.drivetrain
+    joined = drive.center_lock > 0
+    front, rear = (drive.front_share > 0) | joined, (drive.front_share < 1) | joined
+    sees_front, sees_rear = (sees.front_left + sees.front_right, sees.rear_left + sees.rear_right)
+    sees_driven = (front & (sees_front > 0)) | (rear & (sees_rear > 0))
+    slips = [
+        slip * jnp.where(sees_driven, driven, saw > 0)
+        for driven, saw in ((front, sees_front), (rear, sees_rear))
+    ]
+    return tuple(hub + slips[axle] for hub, axle in zip(hubs, (0, 0, 1, 1), strict=True))
 
 
 def asked(commands: Table, ticks: np.ndarray, dt: float) -> AnyCommand:
@@ -434,9 +535,17 @@ def spins(car: Car, rim: Scalar) -> Wheels:
 
 
 def simulate(
-    car: Car, states: State, commands: Table, starts: np.ndarray, ticks: int, dt: float
+    car: Car,
+    states: State,
+    commands: Table,
+    starts: np.ndarray,
+    ticks: int,
+    dt: float,
+    sees: Wheels = MEAN,
 ) -> dict[str, np.ndarray]:
     """Each simulated quantity from the start on: (windows, ticks + 1).
+
+    `sees` gives the share of each wheel in the wheel speed.
 
     Windows are padded to one of `SIZES`, and ticks to whole pieces, to reuse compiled programs.
     """
@@ -446,11 +555,12 @@ def simulate(
         size = next(size for size in SIZES if size >= len(chosen))
         rows = np.minimum(np.arange(begin, begin + size), begin + len(chosen) - 1)
         state = jax.tree.map(lambda leaf, rows=rows: jnp.asarray(leaf[rows]), states)
-        pieces = [np.stack([np.asarray(q) for q in quantities_of(car, state.motion)])[:, :, None]]
+        first = quantities_of(car, state.motion, sees)
+        pieces = [np.stack([np.asarray(q) for q in first])[:, :, None]]
         for piece in range(0, ticks, PIECE):
             count = np.arange(piece, piece + PIECE, dtype=np.int32)
             now = asked(commands, starts[rows][None, :] + count[:, None], dt)
-            state, seen = _advance(car, state, count, now, dt)
+            state, seen = _advance(car, state, count, now, sees, dt)
             pieces.append(np.stack([np.asarray(q).T for q in seen]))
         whole = np.concatenate(pieces, axis=2)
         chunks.append(whole[:, : len(chosen), : ticks + 1])
@@ -459,7 +569,7 @@ def simulate(
 
 @partial(jax.jit, static_argnames="dt")
 def _advance(
-    car: Car, states: State, counts: jax.Array, commands: AnyCommand, dt: float
+    car: Car, states: State, counts: jax.Array, commands: AnyCommand, sees: Wheels, dt: float
 ) -> tuple[State, tuple[jax.Array, ...]]:
     """The states after some ticks of all windows; commands are (ticks, windows)."""
     no_walls = jnp.full((1, 4), jnp.nan)
@@ -468,12 +578,13 @@ def _advance(
         count, command = now
         step = jax.vmap(planar.step, in_axes=(None, None, 0, 0, None, None))
         states = step(car, no_walls, states, command, count, dt)
-        return states, quantities_of(car, states.motion)
+        return states, quantities_of(car, states.motion, sees)
 
     return jax.lax.scan(tick, states, (counts, commands))
 
 
-def quantities_of(car: Car, motion: Motion) -> tuple[Scalar, ...]:
-    """The four quantities; an encoder between the differentials measures the wheels' mean."""
+def quantities_of(car: Car, motion: Motion, sees: Wheels = MEAN) -> tuple[Scalar, ...]:
+    """The four quantities. The wheel speed is of the wheels that an encoder `sees`."""
     rims = [radius * spin for radius, spin in zip(radii(car), motion.wheels, strict=True)]
-    return motion.vx, motion.vy, motion.yaw_rate, sum(rims) / 4
+    seen = sum(share * rim for share, rim in zip(sees, rims, strict=True))
+    return motion.vx, motion.vy, motion.yaw_rate, seen

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _SIZE_IN = (14.0, 9.0)
 _RELEASED = "#f1efe8"
+_DOUBT = "#a33a2a"
+_LONGEST_LINE = 150  # characters of a warning
 _NAMES = {
     "vx_mps": ("Forward velocity", "m/s"),
     "vy_mps": ("Lateral velocity, left positive", "m/s"),
@@ -35,7 +37,7 @@ _NAMES = {
     "wheel_speed_mps": ("Wheel speed", "m/s"),
 }
 _SHOWN_EVERY = 1.0  # s between drawn windows
-_LEFT, _RIGHT, _TOP, _BOTTOM, _CAPTION = 0.055, 0.955, 0.895, 0.065, 0.033  # parts of the figure
+_LEFT, _RIGHT, _TOP, _BOTTOM, _CAPTION = 0.055, 0.955, 0.885, 0.065, 0.033  # parts of the figure
 
 
 def draw_comparison(series: Mapping[str, Any], path: Path) -> None:
@@ -105,6 +107,19 @@ def _write_headline(figure: "Figure", title: str, result: Mapping[str, Any], sho
         size=10.5,
         va="center",
     )
+    warnings = result["warnings"]
+    if warnings:
+        more = f" (and {len(warnings) - 1} more)" if len(warnings) > 1 else ""
+        line = "Warning: " + warnings[0]
+        figure.text(
+            _LEFT,
+            0.9,
+            (line[:_LONGEST_LINE] + "…" if len(line) > _LONGEST_LINE else line) + more,
+            color=_DOUBT,
+            size=9.5,
+            va="center",
+            parse_math=False,
+        )
     for right, words, colour in (
         (0.845, "measured", MEASURED),
         (_RIGHT, "simulated", SIMULATED),

@@ -87,6 +87,7 @@ def tuning_page(result: Mapping[str, Any], series: Sequence[Mapping[str, Any]]) 
         "parameters": _parameters(result["parameters"]),
         "correlations": _correlations(result),
         "residuals": _residuals(result["residuals"]),
+        "sensors": _sensors(result.get("sensors", {})),
         "masked": _folded(unfolded, "Nothing: no fault was found in these logs."),
         "key": _key(),
         "runs": "".join(_run(run, result["runs"]) for run in series),
@@ -439,6 +440,31 @@ def _histogram(name: str, channel: Mapping[str, Any]) -> str:
 # -------------------------------------------------------------------------------------------------
 # Runs
 # -------------------------------------------------------------------------------------------------
+
+
+def _sensors(logs: Mapping[str, Any]) -> str:
+    """What each log tells of its sensors, beside what is declared, and the warnings."""
+    rows, warnings = [], []
+    for name, told in logs.items():
+        warnings += [f"<li>{escape(name)}: {escape(line)}</li>" for line in told["warnings"]]
+        for one in told["estimates"]:
+            if not one["determined"]:
+                continue
+            cells = (
+                escape(name),
+                escape(f"{one['sensor']}.{one['key']}"),
+                f"{_fixed(one['estimated'], 4)} ± {_fixed(one['deviation'], 4)}",
+                f"{_fixed(one['declared'], 4)} ({escape(one['declared_by'])})",
+                escape(one["used"]),
+            )
+            rows.append(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+    if not rows and not warnings:
+        return "<p>The logs tell nothing of them.</p>"
+    head = "".join(
+        f"<th>{word}</th>" for word in ("log", "number", "the log tells", "declared", "used")
+    )
+    table = f'<div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>' if rows else ""
+    return table + (_folded(warnings, "") if warnings else "")
 
 
 def _key() -> str:
