@@ -60,6 +60,24 @@ def test_a_lidar_tells_how_far_the_corner_is(turn, offset):
     assert float(told) == pytest.approx(1.5, abs=0.02)
 
 
+def test_a_car_with_a_lidar_knows_its_corridor_behind_a_corner():
+    """A beam may end on either wall of either corridor: the place before the corner says which."""
+    course, car = load_course("box"), load_car("rx7", ("sensors.lidar.beams=24",))
+    pilot = Pilot.of(drift_turn(course, car), course, car)
+    simulator, legs = Simulator.of(course, car, seed=30003), legs_of(course, 1)
+    loop, memory = simulator.init(), pilot.init(simulator.root)
+    settled = []
+    for _ in range(9):
+        loop, memory, record = scan(simulator, pilot, 250, loop, memory)
+        motion, told = loop.state.motion, record.status
+        true = legs.seen(told.turn[-1], motion.x, motion.y, motion.heading)
+        if told.turn[-1] and not told.phase[-1]:
+            settled.append((told.offset[-1] - true.offset, told.angle[-1] - true.bearing))
+    assert len(settled) >= 2
+    assert np.max(np.abs(settled)) < 0.05
+    assert not np.any(record.wall_contacts)
+
+
 @pytest.mark.parametrize("reports", ["place", "pose"])
 def test_a_place_told_late_is_known_now(reports):
     car = load_car("rx7", (f"sensors.position.reports={reports}", "sensors.position.delay_s=0.05"))
