@@ -67,15 +67,18 @@ def test_a_car_all_but_at_rest_stays_there_in_32_bits() -> None:
 def tiny(rng: np.random.Generator, count: int) -> list[np.ndarray]:
     """Seven speeds each of `count` cars, from 1e-2 down to less than 32 bits hold.
 
-    Those of a car are of one size, or each of its own. Some are 0.
+    Those of a car are of one size, or each of its own. Some are 0. Half of the cars are where
+    squares begin to underflow.
     """
     exponents = rng.uniform(-46, -2, (7, count))
     exponents = np.where(rng.random(count) < 0.5, exponents[:1], exponents)
+    nearly = rng.uniform(-23, -17, count) + rng.normal(0, 0.5, (7, count))
+    exponents = np.where(rng.random(count) < 0.5, nearly, exponents)
     return list(rng.choice((-1, 0, 1), (7, count), p=(0.45, 0.1, 0.45)) * 10.0**exponents)
 
 
 def test_cars_all_but_at_rest_come_to_rest_in_32_bits() -> None:
-    """Squares of speeds below 1e-19 are 0: energies vanish there, and no quotient of them may be."""
+    """Squares of speeds below 1e-19 underflow: energies are 0 there, and a quotient is 0/0."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
         start = fuzz_physics.draw("brush", BOX, rng, 512)

@@ -11,7 +11,7 @@ import numpy as np
 from countersteer.car.car import Car, Lidar
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
-from countersteer.course.position import FAR, as_table
+from countersteer.course.position import FAR, as_table, beyond_corner
 from countersteer.drivers import policy, straighten
 from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.drivers.stop_angle import StopAngle
@@ -132,11 +132,10 @@ class DriftTurn:
         rests = (jnp.abs(estimate.vy) < RESTS[0] * speed) & (jnp.abs(estimate.yaw_rate) < RESTS[1])
         free = (memory.phase == STRAIGHT) | ((memory.phase == SETTLE) & rests)
         begins = jnp.where(self.linked > 0, free & fast, near) & (angle != 0)
-        ahead, aside = gap + corner * jnp.cos(angle), None
+        ahead, aside = corner * jnp.cos(angle), None
         if self.lidar is not None:
-            # Which of the walls a beam ends on can be told only from nearly the right place.
-            ahead = ahead - straight.offset * jnp.sin(angle)
-            aside = corner * jnp.sin(angle) + straight.offset * jnp.cos(angle)
+            # Only from nearly the right place can it be told which wall a beam ends on.
+            ahead, aside = beyond_corner(corner, straight.offset, angle)
         turn = angle + (1 - self.carry) * straight.error
         straight = self.straight.turned(straight, turn, begins, aside)
         hand = jnp.where(begins, jnp.sign(angle), memory.hand)
@@ -187,7 +186,7 @@ class DriftTurn:
             entry,
             hand,
             calm,
-            jnp.where(begins, ahead, corner),
+            jnp.where(begins, gap + ahead, corner),
             jnp.where(begins, DOUBT**2, doubt),
             *spikes,
             straight._replace(integral=integral, command=command),
