@@ -13,12 +13,15 @@ from countersteer.batch.trials import run_trials
 from countersteer.car.files import load_car
 from countersteer.course.course import from_segments
 from countersteer.course.files import load_course
-from countersteer.course.position import legs_of
+from countersteer.course.position import beyond_corner, legs_of
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.estimation import lidar_walls
+from countersteer.estimation.estimate import Estimate
 from countersteer.estimation.kalman import diagonal
+from countersteer.estimation.wall_angle import wall_angle
 from countersteer.pilot import Pilot
 from countersteer.sensing import lidar
+from countersteer.signals import Reading
 from countersteer.simulator import Simulator, scan
 from countersteer.task.judge import Outcome
 from countersteer.world.walls import padded
@@ -58,6 +61,62 @@ def test_a_lidar_tells_how_far_the_corner_is(turn, offset):
     told, sees = lidar_walls.corner_ahead(SCANNER, WIDTH, ranges, error, offset, turn)
     assert sees
     assert float(told) == pytest.approx(1.5, abs=0.02)
+
+
+def test_a_place_before_a_corner_is_the_same_place_behind_it():
+    legs, rng = legs_of(load_course("ess"), 1), np.random.default_rng(0)
+    bearing = legs.bearing
+    for leg in range(3):
+        for x, y in rng.uniform(-2, 8, (5, 2)):
+            before, behind = (legs.seen(at, x, y, 0.0) for at in (leg, leg + 1))
+            angle = bearing[leg + 1] - bearing[leg]
+            ahead, aside = beyond_corner(before.distance, before.offset, angle)
+            dx, dy = legs.x[leg + 1] - legs.x[leg], legs.y[leg + 1] - legs.y[leg]
+            gap = math.cos(bearing[leg + 1]) * dx + math.sin(bearing[leg + 1]) * dy
+            assert float(gap + ahead) == pytest.approx(float(behind.distance), abs=1e-9)
+            assert float(aside) == pytest.approx(float(behind.offset), abs=1e-9)
+
+
+@pytest.mark.parametrize("hand", [-1, 1])
+def test_a_lidar_finds_its_corridor_behind_a_corner(hand):
+    """A turn from 1 m before the corner. A beam may end on either wall of either corridor."""
+    turn = hand * math.pi / 2
+    parts = [("straight", 5.0, 0.0), ("turn", turn, 0.0), ("straight", 5.0, 0.0)]
+    course = from_segments("bend", WIDTH, False, parts)
+    filter_ = wall_angle(load_car("rx7", ("sensors.lidar.beams=72",)), WIDTH)
+    part = np.linspace(0, 1, 81)
+    heading = turn * np.sin(np.minimum(1, 1.3 * part) * math.pi / 2)
+    x, y = 4.0 + 1.3 * np.sin(part * math.pi / 2), hand * (-0.1 + 1.6 * part**2)
+    vx, vy = np.gradient(x) / 0.0125, np.gradient(y) / 0.0125
+    cosine, sine = np.cos(heading), np.sin(heading)
+    ages, sonar = (math.inf,) * 3, (Reading(0.0, 0),) * 3
+
+    @jax.jit
+    def update(memory, estimate, time, pose):
+        scan = Reading(scanned(course, pose), 0)
+        return filter_.update(memory, sonar, ages, estimate, time, scan, 0.0)
+
+    start = filter_.initial_memory(-0.1 * hand)
+    places = {}
+    for name, offset in {
+        "known": beyond_corner(1.0, -0.1 * hand, turn)[1] + 0.1,
+        "unknown": None,
+    }.items():
+        memory = filter_.turned(start, turn, 0.03, offset)
+        for i in range(1, len(part)):
+            estimate = Estimate(
+                x=x[i],
+                y=y[i],
+                heading=heading[i],
+                vx=cosine[i] * vx[i] + sine[i] * vy[i],
+                vy=cosine[i] * vy[i] - sine[i] * vx[i],
+                yaw_rate=(heading[i] - heading[i - 1]) / 0.0125,
+            )
+            memory = update(memory, estimate, 0.0125 * i, (x[i], y[i], heading[i]))
+        places[name] = float(memory.offset)
+    true = hand * (5.0 - x[-1])
+    assert places["known"] == pytest.approx(true, abs=0.02)
+    assert places["unknown"] != pytest.approx(true, abs=0.2)
 
 
 @pytest.mark.parametrize("reports", ["place", "pose"])

@@ -153,6 +153,13 @@ def test_files_that_say_the_same_in_other_words_make_the_same_course(tmp_path):
         "comments": "# made by hand\n" + HEADER + "\n\n".join(rows),
         "from Windows": "\ufeff" + HEADER.replace("\n", "\r\n") + "\r\n".join(rows),
         "blanks": "\n".join(row.replace(",", "  ") for row in rows),
+        "a title": "# A lap, by hand\n" + "\n".join(rows),
+        "a separator at the end": "\n".join(row + "," for row in [HEADER.strip(), *rows]),
+        "race line's names": "# x_ref_m; y_ref_m; width_right_m; width_left_m\n"
+        + "\n".join(rows).replace(",", ";"),
+        "names of a planner": "d_left_iqp,x_m,d_right_iqp,y_m\n"
+        + "\n".join(f"{LEFT},{x:.6f},{RIGHT},{y:.6f}" for x, y in points),
+        "short names": "x,y,w_right,w_left\n" + "\n".join(rows),
     }
     for what, text in others.items():
         (tmp_path / "a.csv").write_bytes(text.encode())
@@ -160,6 +167,111 @@ def test_files_that_say_the_same_in_other_words_make_the_same_course(tmp_path):
         assert np.array_equal(course.line, plain.line), what
         assert np.array_equal(course.walls, plain.walls), what
         assert np.array_equal(course.sides, plain.sides), what
+
+
+@functools.cache
+def way_points() -> dict[str, np.ndarray]:
+    """Columns of a way-point file along an oval."""
+    points = oval(ANGLES[::200])
+    steps = np.roll(points, -1, axis=0) - points
+    heading = np.arctan2(*steps.T[::-1])
+    return {
+        "x": points[:, 0],
+        "y": points[:, 1],
+        "yaw": heading,
+        "yaw to 360": np.mod(heading, 2 * math.pi),
+        "yaw, unwrapped": np.unwrap(heading) + 9,
+        "yaw, noisy": np.mod(heading + np.random.default_rng(0).normal(0, 0.2, 100), 2 * math.pi),
+        "degrees": np.degrees(np.mod(heading, 2 * math.pi)),
+        "compass": np.degrees(np.mod(math.pi / 2 - heading, 2 * math.pi)),
+        "distance": np.cumsum(np.hypot(*steps.T)),
+        "speed": np.full(100, 3.0),
+    }
+
+
+@pytest.mark.parametrize(
+    ("columns", "says"),
+    [
+        ("x y yaw speed", "column 3 is the heading of the line"),
+        ("x y|yaw to 360|speed", "column 3 is the heading of the line"),
+        ("x y|yaw, unwrapped|speed", "column 3 is the heading of the line"),
+        ("x y|yaw, noisy|speed", "column 3 is the heading of the line"),
+        ("x y degrees speed", "column 3 is the heading of the line"),
+        ("x y speed compass", "column 4 is the heading of the line"),
+        ("x y distance speed", "column 3 rises from row to row"),
+        ("distance x y speed", "w_tr_right_m must be a number in [0, 1000]"),
+        ("x y speed", "3 cells, not 4 (x_m, y_m, w_tr_right_m, w_tr_left_m)"),
+        ("x y speed speed speed", "5 cells, not 4 (x_m, y_m, w_tr_right_m, w_tr_left_m)"),
+    ],
+)
+@pytest.mark.parametrize("back", [False, True])
+def test_way_points_without_a_header_are_no_centre_line(columns, says, back, tmp_path):
+    known = way_points()
+    names = [
+        name for part in columns.split("|") for name in ([part] if part in known else part.split())
+    ]
+    table = np.column_stack([known[name] for name in names])
+    if back:  # clockwise: the heading is another, but still it is the line's
+        table = table[::-1] * np.where(np.array(names) == "distance", -1, 1)
+        table[:, np.array(names) == "distance"] += known["distance"][-1]
+    path = tmp_path / "way.csv"
+    np.savetxt(path, table, delimiter=",")
+    refused(path, says)
+
+
+@pytest.mark.parametrize("header", ["{}\n", "# {}\n", "# 5f3a\n# {}\n"])
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        ("x; y; yaw; speed", "w_tr_left_m are missing: a race line and way points"),
+        ("s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2", "a race line and way points"),
+        ("pos_x; pos_y; yaw; speed", "column x_m is missing"),
+        ("x_cm; y_cm; w_tr_right_cm; w_tr_left_cm", "column x_m is missing"),
+        ("x_m; y_m; x_ref_m; y_ref_m; d_right; d_left", "x_m, x_ref_m both say x_m"),
+        ("x_m; y_m; w_tr_right_m; speed", "column w_tr_left_m is missing"),
+    ],
+)
+def test_a_header_that_names_no_centre_line_says_why(header, names, says, tmp_path):
+    path = tmp_path / "line.csv"
+    cells = names.count(";") - 1
+    rows = [f"{x:.4f}; {y:.4f}" + "; 1" * cells for x, y in oval(ANGLES[::200])]
+    path.write_text(header.format(names) + "\n".join(rows))
+    refused(path, says)
+
+
+def test_points_of_both_walls_make_the_same_course(tmp_path):
+    points = oval(ANGLES[::100])
+    course = load_course(write_csv(tmp_path / "a.csv", points, 0.8, 0.8))
+    ahead = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+    aside = 0.8 * np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.hypot(*ahead.T)[:, None]
+    table = np.hstack([points + aside, points - aside])
+    header = "x_left_m,y_left_m,x_right_m,y_right_m"
+    np.savetxt(tmp_path / "b.csv", table, delimiter=",", header=header)
+    edges = load_course(str(tmp_path / "b.csv"))
+    assert edges.line == pytest.approx(course.line, abs=1e-5)
+    assert edges.sides == pytest.approx(course.sides, abs=1e-5)
+    assert np.max(np.abs(beside(oval(ANGLES), along_walls(edges)))) < 0.82
+
+
+def test_a_clockwise_line_is_driven_clockwise_and_one_side_may_have_no_room(tmp_path):
+    points = oval(ANGLES[::100])
+    course = load_course(write_csv(tmp_path / "a.csv", points[::-1], 0.0, 1.0))
+    off = beside(oval(ANGLES), along_walls(course))  # positive inside
+    assert np.min(off) == pytest.approx(-1.0, abs=0.02)
+    assert np.max(off) == pytest.approx(0.0, abs=0.02)
+    assert course.start[2] == pytest.approx(-math.pi / 2, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        (oval(ANGLES[:12_000:100]), "no lap: the last point is"),
+        (np.zeros((20, 2)), "0 points that differ"),
+        (oval(ANGLES[::100]) * [1, 0], "the centre line crosses itself"),
+    ],
+)
+def test_a_line_that_is_no_lap_is_refused(points, says, tmp_path):
+    refused(Path(write_csv(tmp_path / "a.csv", points)), says)
 
 
 CIRCLE = "".join(f"{3 * math.cos(a)},{3 * math.sin(a)},1,1\n" for a in ANGLES[::1000])
@@ -176,10 +288,10 @@ CIRCLE = "".join(f"{3 * math.cos(a)},{3 * math.sin(a)},1,1\n" for a in ANGLES[::
         (CIRCLE + "0,0,0,0\n", "line 21: less than 0.05 m wide"),
         (CIRCLE + "0,0,1\n", "line 21: 3 cells, not 4"),
         (CIRCLE + "a,b,c,d\n", "line 21: x_m must be a number"),
-        ("# s_m; x_m; y_m; psi_rad\n0;0;0;0\n", "column w_tr_right_m is missing"),
+        ("# s_m; x_m; y_m; psi_rad\n0;0;0;0\n", "w_tr_right_m and w_tr_left_m are missing: a race"),
         ("0,0,1,1\n9,9,1,1\n9,0,1,1\n0,9,1,1\n", "the centre line crosses itself"),
         (CIRCLE.replace(",1,1", ",1,4"), "leave no wall inside the lap"),
-        ("\0\1", "line 1: 1 cells, not 4"),
+        ("\0\1", "column x_m is missing"),
     ],
 )
 def test_a_wrong_centre_line_is_refused_in_one_line(text, says, tmp_path):
@@ -342,7 +454,7 @@ def test_the_same_map_in_other_shades_makes_the_same_course(tmp_path):
 
 
 def test_grey_is_free_or_not_as_the_threshold_says(tmp_path):
-    course = load_course(write_map(tmp_path, room(), **ROOM, free_thresh=0.2))
+    course = load_course(write_map(tmp_path, room(), **ROOM, free_thresh=0.2, mode="scale"))
     assert corners(course) == {(x, y) for x in (-3.0, 3.0) for y in (-3.0, 3.0)}
 
 

@@ -64,6 +64,36 @@ def test_a_car_all_but_at_rest_stays_there_in_32_bits() -> None:
         assert np.abs(after[3:10]).max() < 1e-17
 
 
+def tiny(rng: np.random.Generator, count: int) -> list[np.ndarray]:
+    """Seven speeds each of `count` cars, from 1e-2 down to less than 32 bits hold.
+
+    Those of a car are of one size, or each of its own. Some are 0. Half of the cars are where
+    squares begin to underflow.
+    """
+    exponents = rng.uniform(-46, -2, (7, count))
+    exponents = np.where(rng.random(count) < 0.5, exponents[:1], exponents)
+    nearly = rng.uniform(-23, -17, count) + rng.normal(0, 0.5, (7, count))
+    exponents = np.where(rng.random(count) < 0.5, nearly, exponents)
+    return list(rng.choice((-1, 0, 1), (7, count), p=(0.45, 0.1, 0.45)) * 10.0**exponents)
+
+
+def test_cars_all_but_at_rest_come_to_rest_in_32_bits() -> None:
+    """Squares of speeds below 1e-19 underflow: energies are 0 there, and a quotient is 0/0."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        start = fuzz_physics.draw("brush", BOX, rng, 512)
+        vx, vy, yaw_rate, *wheels = tiny(rng, 512)
+        motion = start.motion._replace(vx=vx, vy=vy, yaw_rate=yaw_rate, wheels=Wheels(*wheels))
+        start = start._replace(motion=motion, throttle=0 * start.throttle)
+        seen = fuzz_physics.run(start, BOX, 32)
+        finite = np.all([np.isfinite(leaf) for leaf in jax.tree.leaves(seen)], axis=(0, 1))
+        assert np.all(finite), f"lanes {np.nonzero(~finite)[0][:5]} of seed {seed}"
+        energy, _ = fuzz_physics.energies(start, seen, 32)
+        assert np.all(energy.max(axis=0) < np.maximum(1.00002 * energy[0], 1e-25))
+        # Few have so little friction that they still roll after 200 ticks.
+        assert np.mean(np.hypot(seen.vx[-1], seen.vy[-1]) < 1e-6) > 0.85
+
+
 def test_a_guarded_tick_adds_no_energy_where_the_change_dwarfs_the_motion() -> None:
     car = jax.tree.map(np.float32, load_car("rx7"))
     small, large = np.float32(1e-6), np.float32(1e3)

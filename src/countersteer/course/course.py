@@ -133,14 +133,17 @@ def from_walls(
     return Course(name, None, False, np.zeros((0, 2)), walls, (), start, 0.0, None)
 
 
-def from_track(name: str, line: np.ndarray, sides: np.ndarray, walls: np.ndarray) -> Course:
-    """A closed course along any line. It starts at the first point; the goal is a lap later.
+def from_track(
+    name: str, line: np.ndarray, sides: np.ndarray, walls: np.ndarray, closed: bool = True
+) -> Course:
+    """A course along any line. It starts at the first point, and its goal is the line's end.
 
-    `line` (n, 2) and `sides` (n, 2) go round once, without the first point again.
+    `line` (n, 2) and `sides` (n, 2) of a `closed` one go round once, without the first point again.
     """
-    line, sides = np.vstack([line, line[:1]]), np.vstack([sides, sides[:1]])
+    if closed:
+        line, sides = np.vstack([line, line[:1]]), np.vstack([sides, sides[:1]])
     width = float(np.min(np.sum(sides, axis=1)))
-    course = Course(name, width, True, line, walls, (), (0.0, 0.0, 0.0), 0.0, None, sides)
+    course = Course(name, width, closed, line, walls, (), (0.0, 0.0, 0.0), 0.0, None, sides)
     return dataclasses.replace(course, start=place(course, 0.0), goal_distance=course.length)
 
 

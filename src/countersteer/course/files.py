@@ -74,11 +74,11 @@ def course_from_tables(tables: dict[str, Any], where: str) -> Course:
     if ("segments" in tables) == ("walls_m" in tables):
         raise InputError(f"{where}: give either segments or walls_m")
     if "walls_m" in tables:
-        start = _place(tables, "start", where, PLACES["start of walls"])
+        start = place_of(tables, "start", where, PLACES["start of walls"])
         return from_walls(title, _walls(tables["walls_m"], where), (start[0], start[1], start[2]))
     closed = flag(tables.get("closed", False), f"{where}: closed")
-    start = _place(tables, "start", where, PLACES["start"])
-    goal = _place(tables, "goal", where, PLACES["goal"])[0] if "goal" in tables else None
+    start = place_of(tables, "start", where, PLACES["start"])
+    goal = place_of(tables, "goal", where, PLACES["goal"])[0] if "goal" in tables else None
     width = number(tables.get("width_m"), f"{where}: width_m", 0.05, 100)
     segments = tables["segments"]
     if not isinstance(segments, list) or not all(isinstance(s, dict) for s in segments):
@@ -111,7 +111,8 @@ def _segment(segment: dict[str, Any], where: str) -> Segment:
     )
 
 
-def _place(tables: dict[str, Any], key: str, where: str, known: tuple[str, ...]) -> list[float]:
+def place_of(tables: dict[str, Any], key: str, where: str, known: tuple[str, ...]) -> list[float]:
+    """The numbers of a table `key`, in the order of its `known` keys; 0 for those left out."""
     table = tables.get(key, {})
     if not isinstance(table, dict):
         raise InputError(f"{where}: {key} must be a table")

@@ -98,6 +98,15 @@ class Legs(NamedTuple):
         return Place(-(cosine * dx + sine * dy), cosine * dy - sine * dx, error)
 
 
+def beyond_corner(distance: Scalar, offset: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
+    """A place `distance` before a corner by `angle`, seen from the leg behind it.
+
+    The result is the distance (m) along that leg to the corner, and the offset from that leg.
+    """
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    return distance * cosine - offset * sine, distance * sine + offset * cosine
+
+
 def as_table(values: np.ndarray, filling: float) -> np.ndarray:
     """Values (n,), filled up to a whole number of `TABLE` rows."""
     rows = math.ceil(len(values) / TABLE) * TABLE

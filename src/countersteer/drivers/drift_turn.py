@@ -11,7 +11,7 @@ import numpy as np
 from countersteer.car.car import Car, Lidar
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
-from countersteer.course.position import FAR, as_table
+from countersteer.course.position import FAR, as_table, beyond_corner
 from countersteer.drivers import policy, straighten
 from countersteer.drivers.driver import Observation, Status, paced
 from countersteer.drivers.stop_angle import StopAngle
@@ -132,7 +132,12 @@ class DriftTurn:
         rests = (jnp.abs(estimate.vy) < RESTS[0] * speed) & (jnp.abs(estimate.yaw_rate) < RESTS[1])
         free = (memory.phase == STRAIGHT) | ((memory.phase == SETTLE) & rests)
         begins = jnp.where(self.linked > 0, free & fast, near) & (angle != 0)
-        straight = self.straight.turned(straight, angle + (1 - self.carry) * straight.error, begins)
+        ahead, aside = corner * jnp.cos(angle), None
+        if self.lidar is not None:
+            # Only from nearly the right place can it be told which wall a beam ends on.
+            ahead, aside = beyond_corner(corner, straight.offset, angle)
+        turn = angle + (1 - self.carry) * straight.error
+        straight = self.straight.turned(straight, turn, begins, aside)
         hand = jnp.where(begins, jnp.sign(angle), memory.hand)
         entry = jnp.where(begins, speed, memory.entry)
 
@@ -181,7 +186,7 @@ class DriftTurn:
             entry,
             hand,
             calm,
-            jnp.where(begins, gap + corner * jnp.cos(angle), corner),
+            jnp.where(begins, gap + ahead, corner),
             jnp.where(begins, DOUBT**2, doubt),
             *spikes,
             straight._replace(integral=integral, command=command),
@@ -259,10 +264,10 @@ def drift_turn(
     in any corner is over half the width w, else "wall". In such a corner the wall ahead is oblique
     by more than asin(R / (R + w/2)) = 30°, and not where a mitred corner would have it.
 
-    Raises `InputError` for a closed course without corners, such as a centre line or a map.
+    Raises `InputError` for a course without corners to count, such as a centre line or a map.
     """
     turns = course.turns_ahead(laps)
-    if course.closed and not turns:
+    if course.sides is not None and not turns:
         raise InputError(
             f"{course.name}: drift-turn needs straights with corners between them; "
             "examples/grip_limit.py laps a course without"

@@ -91,7 +91,10 @@ def pursuit(course: Course, car: Car, speed: float | None = None) -> Pursuit:
     Raises `InputError` for free walls.
     """
     if not len(course.line):
-        raise InputError(f"{course.name}: free walls have no centre line for pursuit to follow")
+        raise InputError(
+            f"{course.name}: free walls have no centre line for pursuit to follow: give a course "
+            "with segments, or a map with a goal"
+        )
     top = FASTEST if speed is None else speed
     return Pursuit(
         line=line_of(course),

@@ -132,13 +132,15 @@ class Straighten:
             offset = offset + jnp.where(news, self.blend * (at - offset), 0.0)
         return offset
 
-    def turned(self, memory: StraightenMemory, angle: Scalar, now: Scalar) -> StraightenMemory:
-        """If `now`: the memory in the corridor after a corner by `angle`, its offset unknown."""
+    def turned(
+        self, memory: StraightenMemory, angle: Scalar, now: Scalar, offset: Scalar | None = None
+    ) -> StraightenMemory:
+        """If `now`: the memory in the corridor after a corner by `angle`; its `offset` if known."""
         walls = memory.walls
         if self.by == "filter":
-            walls = self.walls.turned(walls, angle, DOUBT)
+            walls = self.walls.turned(walls, angle, DOUBT, offset)
         beyond = memory._replace(
-            offset=0.0 * memory.offset,
+            offset=0.0 * memory.offset if offset is None else offset,
             error=memory.error - angle,
             integral=0.0,
             walls=walls,

@@ -30,6 +30,7 @@ TURNING = 1.0  # rad/s of yaw rate, from which sonars are ignored: a wall may be
 STEEPEST = math.radians(20)  # angle to the walls beyond which sonars are ignored
 SCANNED = math.radians(35)  # the same of a lidar's beams
 NEAREST = 0.08  # m; the middle of a car cannot be nearer to a wall
+CARRIED = 0.1  # m: standard deviation of an offset that is known from before a corner
 COARSE = 0.05  # m: additional error of a reading while the offset is hardly known
 REPEATS = 16  # equal readings after which a sonar counts as stuck
 GATE = 3.5  # standard deviations beyond which a reading is not of the wall
@@ -101,16 +102,22 @@ class WallAngle:
         )
 
     def turned(
-        self, memory: WallAngleMemory, angle: Scalar, doubt: Scalar = 0.03
+        self,
+        memory: WallAngleMemory,
+        angle: Scalar,
+        doubt: Scalar = 0.03,
+        offset: Scalar | None = None,
     ) -> WallAngleMemory:
-        """The memory in the corridor after a corner of this angle; its offset is unknown.
+        """The memory in the corridor after a corner of this angle.
 
-        `doubt` is what the corner adds to the angle's standard deviation (rad).
+        `doubt` is what the corner adds to the angle's standard deviation (rad). `offset` (m) is
+        that in the new corridor, if it is known.
         """
         bias = entry(memory.covariance, BIAS, BIAS)
         steep = entry(memory.covariance, ANGLE, ANGLE)
-        covariance = diagonal([self.width / 4, jnp.sqrt(steep) + doubt, jnp.sqrt(bias)])
-        mean = (0.0 * angle, memory.angle - angle, memory.mean[BIAS])
+        spread = self.width / 4 if offset is None else CARRIED
+        covariance = diagonal([spread, jnp.sqrt(steep) + doubt, jnp.sqrt(bias)])
+        mean = (0.0 * angle if offset is None else offset, memory.angle - angle, memory.mean[BIAS])
         return memory._replace(mean=mean, covariance=covariance)
 
     def update(
