@@ -24,7 +24,10 @@ MAY_IMPORT = {
     "drivers": {"car", "course", "estimation", "world"},  # the motor's law, for feed-forward
     "planning": {"car", "course", "world", "drivers"},
     "pilot": {"car", "course", "link", "estimation", "drivers"},  # and not the world
-    "simulator": {"car", "course", "world", "sensing", "link", "drivers", "pilot"},
+    "simulator": {
+        "car", "course", "world", "sensing", "link", "drivers", "pilot",
+        "estimation",  # the estimate is in the record
+    },
     "task": {"car", "course"},
     "runs": {"car", "course"},
     "tuning": {"car", "world", "sensing", "runs"},

@@ -19,7 +19,7 @@ from countersteer.course.files import course_tables
 from countersteer.drivers.registry import make_driver
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
-from countersteer.runs.files import read_commands
+from countersteer.runs.files import COVARIANCE, ESTIMATE, read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
 from countersteer.sensing.all_sensors import channels
 from countersteer.sensing.faults import SensorFault, fault_tables
@@ -202,7 +202,10 @@ def drive(
     laps = int(about["laps"])
     task, pace = Task.of(course, laps), pace_of(simulator)
     score, outcome = task.init(), Outcome.DRIVING
-    with Recorder(folder, about, channels=channels(simulator.car), pace=pace) as recorder:
+    # Who plays commands looks at no estimate.
+    more = {} if about["pilot"].get("kind") == "replay" else {"estimate": ESTIMATE}
+    sensors = channels(simulator.car)
+    with Recorder(folder, about, channels=sensors, pace=pace, more=more) as recorder:
         with (
             Interrupt() as interrupt,
             contextlib.closing(simulator.run(pilot, longest)) as pieces,
@@ -245,6 +248,8 @@ def warm_up(what: Drive) -> None:
 def frames(record: Record, end: int) -> Frames:
     """The frames of the first `end` rows of a record, for the recorder."""
     truth = truth_columns(record.motion, record.voltage)
-    whole = Frames(record.tick, record.readings, record.command, record.fresh, truth)
+    known = record.estimate
+    estimate = known and (*known[:6], *(getattr(known.pose_covariance, k[:2]) for k in COVARIANCE))
+    whole = Frames(record.tick, record.readings, record.command, record.fresh, truth, estimate)
     cut: Frames = jax.tree.map(lambda leaf: leaf[:end], whole)
     return cut

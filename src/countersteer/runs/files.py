@@ -18,6 +18,13 @@ from countersteer.writing import naming, write_whole
 log = logging.getLogger(__name__)
 
 COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
+COVARIANCE = ("xx_m2", "xy_m2", "yy_m2")  # of the place; zeros: unknown
+# What the pilot takes for its motion, in the axes of the ground truth.
+ESTIMATE = (
+    "time_s", "x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps", *COVARIANCE,
+)  # fmt: skip
+# Places on each path that a planner looked at, one path after the other.
+ROLLOUTS = ("time_s", "rollout", "cost", "x_m", "y_m")
 LARGEST_STEERING = 90.0  # degrees
 LATEST = 1e6  # s, of a time; a clock of Unix time is beyond
 LONGEST = 3600.0  # s, of what is simulated on the commands of a log

@@ -51,6 +51,7 @@ class Frames(NamedTuple):
     command: Command  # of the car from this instant on
     fresh: np.ndarray  # True for a new command
     truth: tuple[np.ndarray, ...] | None = None  # values of `TRUTH`; None: unknown
+    estimate: tuple[np.ndarray, ...] | None = None  # values of `ESTIMATE` but the time
 
 
 @contextlib.contextmanager
@@ -169,11 +170,13 @@ class Recorder:
         headers: Mapping[str, Sequence[str]] | None = None,
         channels: Readings | None = None,
         pace: Pace | None = None,
+        more: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         """Write `run.toml` and the `headers` of the tables, by name.
 
         Frames need the `channels` of the car's sensors and the `pace`. Their headers follow from
-        the channels.
+        the channels, and `more` adds tables: `estimate` for frames that have one, and those that
+        `write` fills.
         """
         self.folder = folder
         self._channels, self._pace = channels, pace
@@ -182,6 +185,7 @@ class Recorder:
             told = [column for channel in flat(channels) for column in channel.columns]
             truth = ("time_s", *(channel.name for channel in TRUTH))
             headers = {"commands": COMMANDS, "telemetry": ("time_s", *told), "truth": truth}
+            headers |= more or {}
         assert headers is not None
         text = toml_of(about)
         write_whole(folder / "run.toml", text)
@@ -226,6 +230,8 @@ class Recorder:
         self._last = int(tick[-1]) if len(tick) else self._last
         if frames.truth is not None:
             tables["truth"] = [np.asarray(column)[shown] for column in (time, *frames.truth)]
+        if frames.estimate is not None and "estimate" in self._tables:
+            tables["estimate"] = [np.asarray(c)[shown] for c in (time, *frames.estimate)]
         self.write(tables)
 
     def write(self, tables: Mapping[str, Sequence[np.ndarray]]) -> None:

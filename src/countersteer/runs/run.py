@@ -12,7 +12,7 @@ from countersteer.car.files import car_from_tables, library, load_car
 from countersteer.errors import InputError
 from countersteer.reading.content import read_text, reading
 from countersteer.reading.documents import json_object, toml
-from countersteer.runs.files import LONGEST, Table, read_commands, read_measurements
+from countersteer.runs.files import ESTIMATE, LONGEST, ROLLOUTS, Table, read_commands, read_measurements
 from countersteer.runs.keys import check_about, check_summary
 from countersteer.text import checked_format
 
@@ -29,6 +29,8 @@ class Run:
     telemetry: Table | None
     truth: Table | None
     summary: dict[str, Any] = dataclasses.field(default_factory=dict)  # summary.json
+    estimate: Table | None = None  # what the pilot took for its motion
+    rollouts: Table | None = None  # paths that a planner looked at
 
     @property
     def car(self) -> Car | None:
@@ -106,6 +108,7 @@ def read_run(path: Path) -> Run:
 def _read(path: Path) -> Run:
     recorded = (path / "run.mcap").exists()  # no table that was written by hand
     telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
+    estimate, rollouts = path / "estimate.csv", path / "rollouts.csv"
     return Run(
         path,
         read_about(path / "run.toml"),
@@ -115,4 +118,6 @@ def _read(path: Path) -> Run:
         if truth.exists()
         else None,
         read_summary(summary) if summary.exists() else {},
+        read_measurements(estimate, ESTIMATE, recorded) if estimate.exists() else None,
+        read_measurements(rollouts, ROLLOUTS, recorded) if rollouts.exists() else None,
     )

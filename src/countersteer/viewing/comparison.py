@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SIZE_IN = (14.0, 9.0)
-_RELEASED = "#f1efe8"
+_RELEASED = light("turn")
 _NAMES = {
     "vx_mps": ("Forward velocity", "m/s"),
     "vy_mps": ("Lateral velocity, left positive", "m/s"),

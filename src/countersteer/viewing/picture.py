@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from countersteer.viewing.style import DPI, INK, LINE, PAPER, SOFT, new_figure
+from countersteer.viewing.style import DPI, INK, LINE, PAPER, SLIP_COLOURS, SOFT, light, new_figure
+from countersteer.viewing.look import (
+    BODY,
+    REAR_WINDOW,
+    SKID_DARKEST,
+    SKID_FROM_MPS,
+    SKID_FULL_MPS,
+    WINDSCREEN,
+)
 from countersteer.writing import write_whole
 
 if TYPE_CHECKING:
@@ -27,24 +35,12 @@ Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]  # left, bottom, width, height; parts of the figure
 
 _SIZE_IN = (14.0, 9.0)
-FLOOR = "#fbfaf6"
-WALL, GLASS, _TURN, SPEED = "#39434c", "#303a43", "#f3eee1", "#0069a8"
-_GOOD, _BAD = "#00694f", "#a3210f"
-# From calm to wild. The lightness always falls, so the order is clear without red and green.
-SLIP_COLOURS = ("#a9bac7", "#e39a2b", "#a3210f")
+FLOOR, WALL, GLASS = light("floor"), light("wall"), light("glass")
+_TURN, SPEED, SIDESLIP = light("turn"), light("velocity"), light("slip-mid")
+_GOOD, _BAD = light("good"), light("bad")
 
-SKID_FROM_MPS, SKID_FULL_MPS = 0.3, 2.0
-_SKID_FAINTEST, SKID_DARKEST = 0.12, 0.42
+_SKID_FAINTEST = 0.12
 _MOST_SKID_SAMPLES = 2000
-
-# Outlines in halves of the car's length and width, from the centre of the outline.
-_LEFT_OF_BODY = [
-    *((-1.0, 0.3), (-0.98, 0.7), (-0.92, 0.92), (-0.8, 1.0), (-0.5, 0.96), (-0.2, 0.93)),
-    *((0.2, 0.93), (0.62, 0.96), (0.82, 0.88), (0.94, 0.66), (1.0, 0.3)),
-]
-BODY = np.array(_LEFT_OF_BODY + [(u, -v) for u, v in reversed(_LEFT_OF_BODY)])
-WINDSCREEN = np.array([(0.3, 0.6), (0.36, 0), (0.3, -0.6), (0.06, -0.5), (0.09, 0), (0.06, 0.5)])
-REAR_WINDOW = np.array([(-0.6, 0.56), (-0.62, 0), (-0.6, -0.56), (-0.42, -0.46), (-0.42, 0.46)])
 
 _GHOST_EVERY_S, _GHOST_EVERY_IN_TURN_S, _MOST_GHOSTS = 0.25, 0.15, 160
 # Ghosts that hide each other show nothing. These are the least distances, in car lengths, from a
@@ -374,7 +370,7 @@ def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> No
     """Draw the quantities over time, one strip under the other."""
     strips = (
         _Strip("Speed", "m/s", view["speed_mps"], SPEED),
-        _Strip("Sideslip", "°", view["sideslip_deg"], "#c97a10"),
+        _Strip("Sideslip", "°", view["sideslip_deg"], SIDESLIP),
         _Strip("Yaw rate", "°/s", view["yaw_rate_degps"], SOFT),
         _Strip("Steering", "°", view["steering_deg"], SOFT, view["steering_command_deg"]),
         _Strip("Throttle", "%", [100 * part for part in view["throttle"]], SOFT),
@@ -464,7 +460,7 @@ class Painter:
 
     def draw(self, view: dict[str, Any]) -> None:
         """Begins `picture_png`, over there."""
-        self._view = json.dumps(view).encode()
+        self._view = json.dumps(view, default=np.ndarray.tolist).encode()
         self._thread = threading.Thread(target=self._send)
         self._thread.start()
 

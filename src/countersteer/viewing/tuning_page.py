@@ -52,7 +52,7 @@ MEASURES = {
 MANY = 6  # lines; a longer list is folded
 CORRELATED = 0.8
 
-_HELD_OUT = "#7a5ba8"
+_HELD_OUT = light("held-out")
 _WIDTH_IN, _STRIP_IN, _FOOT_IN, _DPI = 11.0, 1.35, 0.45, 120
 _LONGEST = 40.0  # s, longest drawn part of a log
 _MOST_WINDOWS = 40  # in a strip

@@ -1,0 +1,104 @@
+"""Runs side by side: at the same time, or at the same place along the first one's path."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+STEP = 0.05  # m between two points of the path; less is noise of the measurement
+BACK, AHEAD = 0.3, 1.0  # m of the path in which the next place is looked for, beyond the distance moved
+QUANTITIES = ("speed_mps", "sideslip_deg", "yaw_rate_degps", "steering_deg")
+
+View = Mapping[str, Any]
+
+
+def places(views: Sequence[View]) -> list[np.ndarray | None]:
+    """The place (m) along the first view's path at each sample of each view; it never falls.
+
+    It is None where a view has no path, and for all if the first has none.
+    """
+    first = _points(views[0])
+    if first is None:
+        return [None] * len(views)
+    path = first[_apart(first)]
+    return [None if (p := _points(view)) is None else _along(path, p) for view in views]
+
+
+def _points(view: View) -> np.ndarray | None:
+    return np.column_stack([view["x_m"], view["y_m"]]) if "x_m" in view else None
+
+
+def _apart(points: np.ndarray) -> list[int]:
+    """The indices of points that are at least `STEP` from the one chosen before."""
+    chosen = [0]
+    for i, (x, y) in enumerate(points.tolist()):
+        last = points[chosen[-1]]
+        if (x - last[0]) ** 2 + (y - last[1]) ** 2 >= STEP**2:
+            chosen.append(i)
+    return chosen
+
+
+def _along(path: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The place of each point along a path: of the nearest point of it, looked for near the last.
+
+    So a course that is driven again, or that crosses itself, has different places on each pass.
+    """
+    edges = np.hypot(*np.diff(path, axis=0).T)
+    mark = np.concatenate([[0.0], np.cumsum(edges)])
+    found, at = np.zeros(len(points)), 0.0
+    moved = np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)
+    for i, point in enumerate(points):
+        low = int(np.searchsorted(mark, at - BACK))
+        high = int(np.searchsorted(mark, at + moved[i] + (AHEAD if i else 0.0)))
+        near = path[low : high + 2]
+        if len(near) < 2:
+            found[i] = at
+            continue
+        along = np.diff(near, axis=0)
+        square = np.maximum(np.sum(along**2, axis=1), 1e-12)
+        part = np.clip(np.sum((point - near[:-1]) * along, axis=1) / square, 0, 1)
+        away = np.hypot(*(near[:-1] + part[:, None] * along - point).T)
+        best = int(np.argmin(away))
+        at = max(at, float(mark[low + best] + part[best] * np.sqrt(square[best])))
+        found[i] = at
+    return found
+
+
+def differences(views: Sequence[View], by: str) -> Iterator[dict[str, Any]]:
+    """For each view but the first: root mean square and largest difference from the first.
+
+    `by` is `time` or `place`. Each is over what both have. `apart_m` is the distance of the cars;
+    by place, `later_s` is how much later the other one is at the last common place.
+    """
+    axis = {"time": "time_s", "place": "place_m"}[by]
+    place = places(views)
+    whole = [dict(view) | {"place_m": p} for view, p in zip(views, place, strict=True)]
+    first = whole[0]
+    for other in whole[1:]:
+        found: dict[str, Any] = {"run": other["name"], "by": by}
+        if first[axis] is not None and other[axis] is not None:
+            low, high = (f([first[axis][k], other[axis][k]]) for k, f in ((0, max), (-1, min)))
+            grid = np.linspace(low, max(low, high), 2000)
+            found |= {f"{axis}_from": float(low), f"{axis}_to": float(high)}
+            at = {
+                name: [np.interp(grid, one[axis], one[name]) for one in (first, other)]
+                for name in (*QUANTITIES, "x_m", "y_m", "time_s")
+                if name in first and name in other
+            }
+            for name in QUANTITIES:
+                if name in at:
+                    found[name] = _size(at[name][1] - at[name][0])
+            if "x_m" in at:
+                gap = np.hypot(at["x_m"][1] - at["x_m"][0], at["y_m"][1] - at["y_m"][0])
+                found["apart_m"] = _size(gap)
+            if by == "place":
+                late = at["time_s"][1] - at["time_s"][0]
+                found["later_s"] = float(late[-1] - late[0])
+        yield found
+
+
+def _size(difference: np.ndarray) -> dict[str, float | None]:
+    known = np.abs(difference[np.isfinite(difference)])
+    if not len(known):
+        return {"rms": None, "largest": None}
+    return {"rms": float(np.sqrt(np.mean(known**2))), "largest": float(known.max())}
