@@ -12,7 +12,14 @@ from countersteer.car.files import car_from_tables, library, load_car
 from countersteer.errors import InputError
 from countersteer.reading.content import read_text, reading
 from countersteer.reading.documents import json_object, toml
-from countersteer.runs.files import ESTIMATE, LONGEST, ROLLOUTS, Table, read_commands, read_measurements
+from countersteer.runs.files import (
+    ESTIMATE,
+    LONGEST,
+    ROLLOUTS,
+    Table,
+    read_commands,
+    read_measurements,
+)
 from countersteer.runs.keys import check_about, check_summary
 from countersteer.text import checked_format
 

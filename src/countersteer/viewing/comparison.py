@@ -18,6 +18,7 @@ from countersteer.viewing.style import (
     draw_commands,
     draw_windows,
     dress,
+    light,
     new_figure,
 )
 from countersteer.writing import whole

@@ -31,6 +31,5 @@ def look_module() -> str:
         "skidFull": SKID_FULL_MPS,
         "skidDarkest": SKID_DARKEST,
     }
-    return (
-        f"// Made from viewing/look.py.\nexport const LOOK = {json.dumps(look, separators=(',', ':'))};\n"
-    )
+    data = json.dumps(look, separators=(",", ":"))
+    return f"// Made from viewing/look.py.\nexport const LOOK = {data};\n"

@@ -9,13 +9,11 @@ import pathlib
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from countersteer.viewing.style import DPI, INK, LINE, PAPER, SLIP_COLOURS, SOFT, light, new_figure
 from countersteer.viewing.look import (
     BODY,
     REAR_WINDOW,
@@ -24,6 +22,7 @@ from countersteer.viewing.look import (
     SKID_FULL_MPS,
     WINDSCREEN,
 )
+from countersteer.viewing.style import DPI, INK, LINE, PAPER, SLIP_COLOURS, SOFT, light, new_figure
 from countersteer.writing import write_whole
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ def picture_png(view: dict[str, Any]) -> bytes:
     low, high = _bounds(view)
     layout = _BELOW if high[0] - low[0] > _LONG * (high[1] - low[1]) else _BESIDE
     colours = LinearSegmentedColormap.from_list("sideslip", SLIP_COLOURS)
-    largest = float(np.max(np.abs(view["sideslip_deg"])))
+    largest = float(np.max(np.abs(_sideslip(view)), initial=0.0))
     colours_end = max(20, 5 * math.ceil(largest / 5))
 
     _write_headline(figure, view, largest)
@@ -91,6 +90,16 @@ def picture_png(view: dict[str, Any]) -> bytes:
     png = io.BytesIO()
     canvas.print_png(png, pil_kwargs={"compress_level": 1})
     return png.getvalue()
+
+
+def _sideslip(view: dict[str, Any]) -> Array:
+    """The sideslip (°), and 0 where it is unknown."""
+    return np.nan_to_num(np.array(view.get("sideslip_deg", np.zeros(len(view["time_s"])))))
+
+
+def _steering(view: dict[str, Any]) -> Array:
+    """The angle of the front wheels (°): as simulated, or else as asked for."""
+    return np.array(view.get("steering_deg", view["steering_command_deg"]))
 
 
 def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
@@ -202,7 +211,7 @@ def _draw_ghosts(
     poses = _poses(view)[chosen]
     half = np.array([car["length_m"] / 2, car["width_m"] / 2])
     centre = np.array([car["center_x_m"], 0.0])
-    paints = colours(np.abs(np.array(view["sideslip_deg"])[chosen]) / colours_end)
+    paints = colours(np.abs(_sideslip(view)[chosen]) / colours_end)
     body, windscreen, rear_window = (
         placed(shape * half + centre, poses) for shape in (BODY, WINDSCREEN, REAR_WINDOW)
     )
@@ -291,7 +300,7 @@ def _placed_wheel(
     if view["wheels"]:
         angle = np.array(view["wheels"][which]["angle_rad"])[chosen]
     elif which < 2:
-        angle = np.radians(np.array(view["steering_deg"])[chosen])
+        angle = np.radians(_steering(view)[chosen])
     else:
         angle = np.zeros(len(chosen))
     hub = placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
@@ -361,20 +370,26 @@ class _Strip(NamedTuple):
 
     name: str
     unit: str
-    values: Sequence[float]
+    values: Array
     colour: str
-    command: Sequence[float] | None = None
+    command: Array | None
 
 
 def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> None:
     """Draw the quantities over time, one strip under the other."""
-    strips = (
-        _Strip("Speed", "m/s", view["speed_mps"], SPEED),
-        _Strip("Sideslip", "°", view["sideslip_deg"], SIDESLIP),
-        _Strip("Yaw rate", "°/s", view["yaw_rate_degps"], SOFT),
-        _Strip("Steering", "°", view["steering_deg"], SOFT, view["steering_command_deg"]),
-        _Strip("Throttle", "%", [100 * part for part in view["throttle"]], SOFT),
-    )
+    asked = view["steering_command_deg"]
+    strips = [
+        _Strip(name, unit, values, colour, command)
+        for name, unit, values, colour, command in (
+            ("Speed", "m/s", view.get("speed_mps"), SPEED, None),
+            ("Sideslip", "°", view.get("sideslip_deg"), SIDESLIP, None),
+            ("Yaw rate", "°/s", view.get("yaw_rate_degps"), SOFT, None),
+            ("Steering", "°", view.get("steering_deg"), SOFT, asked),
+            ("Steering asked for", "°", None if "steering_deg" in view else asked, SOFT, None),
+            ("Throttle", "%", 100 * np.array(view["throttle"]), SOFT, None),
+        )
+        if values is not None
+    ]
     left, bottom, width, height = place
     pitch = height / len(strips)
     caption = 0.026
@@ -388,8 +403,9 @@ def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> No
 def _draw_strip(axes: "Axes", strip: _Strip, view: dict[str, Any], is_last: bool) -> None:
     """Draw the curves of one strip. Only the last strip has labels on its time axis."""
     time = view["time_s"]
-    shown = [0.0, *strip.values, *(strip.command or ())]
-    low, high = min(shown), max(shown)
+    lines = [strip.values] if strip.command is None else [strip.values, strip.command]
+    shown = np.nan_to_num(np.concatenate([[0.0], *lines]))
+    low, high = float(shown.min()), float(shown.max())
     # A quantity that never changes still needs a height.
     span = max(high - low, 1e-3)
     for turn in view["summary"]["turns"]:

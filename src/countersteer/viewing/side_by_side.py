@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 
 STEP = 0.05  # m between two points of the path; less is noise of the measurement
-BACK, AHEAD = 0.3, 1.0  # m of the path in which the next place is looked for, beyond the distance moved
+# m of the path in which the next place is looked for, besides the distance moved
+BACK, AHEAD = 0.3, 1.0
+BEYOND = 2.0  # m by which the path goes on straight before its begin and after its end
 QUANTITIES = ("speed_mps", "sideslip_deg", "yaw_rate_degps", "steering_deg")
 
 View = Mapping[str, Any]
@@ -43,17 +45,15 @@ def _along(path: np.ndarray, points: np.ndarray) -> np.ndarray:
 
     So a course that is driven again, or that crosses itself, has different places on each pass.
     """
+    path = np.vstack([_beyond(path[0], path[1:2]), path, _beyond(path[-1], path[-2:-1])])
     edges = np.hypot(*np.diff(path, axis=0).T)
-    mark = np.concatenate([[0.0], np.cumsum(edges)])
-    found, at = np.zeros(len(points)), 0.0
+    mark = np.concatenate([[0.0], np.cumsum(edges)]) - BEYOND
+    found, at = np.zeros(len(points)), -BEYOND
     moved = np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)
     for i, point in enumerate(points):
-        low = int(np.searchsorted(mark, at - BACK))
-        high = int(np.searchsorted(mark, at + moved[i] + (AHEAD if i else 0.0)))
+        low = int(np.clip(np.searchsorted(mark, at - BACK) - 1, 0, len(path) - 2))
+        high = int(np.searchsorted(mark, at + moved[i] + (AHEAD if i else BEYOND)))
         near = path[low : high + 2]
-        if len(near) < 2:
-            found[i] = at
-            continue
         along = np.diff(near, axis=0)
         square = np.maximum(np.sum(along**2, axis=1), 1e-12)
         part = np.clip(np.sum((point - near[:-1]) * along, axis=1) / square, 0, 1)
@@ -62,6 +62,13 @@ def _along(path: np.ndarray, points: np.ndarray) -> np.ndarray:
         at = max(at, float(mark[low + best] + part[best] * np.sqrt(square[best])))
         found[i] = at
     return found
+
+
+def _beyond(end: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """A point `BEYOND` an end of a path, straight on from the next point `inner` (one or none)."""
+    way = end - inner[0] if len(inner) else np.array([1.0, 0.0])
+    beyond: np.ndarray = end + BEYOND * way / np.hypot(*way)
+    return beyond
 
 
 def differences(views: Sequence[View], by: str) -> Iterator[dict[str, Any]]:

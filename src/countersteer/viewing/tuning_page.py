@@ -24,6 +24,7 @@ from countersteer.viewing.style import (
     draw_commands,
     draw_windows,
     dress,
+    light,
     new_figure,
 )
 from countersteer.writing import write_whole

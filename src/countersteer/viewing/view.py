@@ -75,7 +75,7 @@ def title(run: Run) -> str:
     """What was driven, in a line."""
     about = run.about
     if "log_format" in about:
-        return f"{run.path.name}, a log of {about.get('car_name')} ({about['log_format']})"
+        return f"{run.path.name}, a log of {about.get('car_name')}"
     place = about.get("course", {}).get("name", "open floor")
     return f"{place}, {about.get('driver')}, {about.get('car_name')}, seed {about.get('seed')}"
 

@@ -35,7 +35,7 @@ export function drawGrid(pen, theme, size, moment, car) {
   const foot = size.height - size.foot;
   columns.forEach((x) => {
     const [at] = camera.pixel(x - camera.x, 0);
-    if (at > 40 && at < size.width - 100) c.fillText(tickLabel(x), at, foot);
+    if (at > 40 && at < size.width - 200) c.fillText(tickLabel(x), at, foot);
   });
   c.textBaseline = "middle";
   c.textAlign = "left";
@@ -46,7 +46,7 @@ export function drawGrid(pen, theme, size, moment, car) {
   c.fillText("y, m", 6, size.head + 10);
   c.textAlign = "right";
   c.textBaseline = "bottom";
-  c.fillText("x, m", size.width - 76, foot);
+  c.fillText("x, m", size.width - 160, foot);
 }
 
 export function drawWalls(pen, walls, theme, car) {

@@ -218,7 +218,7 @@ function fitWindow() {
 
 part("ramp-end").textContent = rampEnd + "°";
 part("end").textContent = `/ ${clock.end.toFixed(2)} s`;
-document.querySelector(".stage").hidden = !drives.some(hasPath);
+document.querySelector(".page").classList.toggle("pathless", !drives.some(hasPath));
 part("comparing").hidden = part("runs").hidden = part("compared").hidden = alone;
 part("axis").hidden = !drives.every((one) => one.place_m);
 part("ramp").hidden = !alone;

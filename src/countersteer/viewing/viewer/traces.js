@@ -1,7 +1,7 @@
 // Quantities over time, or over the place along the first drive's path, one strip each.
 
 import { indexAt, valueAt } from "./drive.js";
-import { clamp, niceStep, signed, tickLabel, ticksBetween } from "./numbers.js";
+import { clamp, signed, tickLabel, ticksBetween } from "./numbers.js";
 
 const MOST_DIFFERENCES = 4000;  // samples of a difference
 const NARROW = 640;  // px
@@ -138,7 +138,7 @@ export class Traces {
 
   layOut() {
     const narrow = this.width < NARROW, heading = narrow ? 19 : 0, gap = narrow ? 4 : 7;
-    const lane = this.events.length ? 18 : 0, foot = 34, top = 8 + lane, { rows } = this;
+    const lane = this.events.length ? 22 : 0, foot = 34, top = 8 + lane, { rows } = this;
     this.narrow = narrow;
     this.lane = lane && { top: 8, bottom: 8 + lane - 7 };
     this.left = narrow ? 40 : 182;
@@ -248,6 +248,10 @@ export class Traces {
       if (to > this.left && from < this.right) {
         c.fillRect(from, top, Math.max(to - from, 1.5), bottom - top);
       }
+      Object.assign(c, { font: this.theme.font(10.5), textAlign: "left", textBaseline: "middle" });
+      if (c.measureText(event.label).width > to - from - 12) continue;
+      c.fillStyle = this.theme.colour("card");
+      c.fillText(event.label, from + 6, (top + bottom) / 2 + 0.5);
     }
   }
 
@@ -405,7 +409,7 @@ function scaleRow(row) {
   const range = Math.max(high - low, 10 ** -row.digits);
   row.low = low - 0.06 * range;
   row.high = high + 0.06 * range;
-  row.ticks = ticksBetween(low, high, niceStep(range / 2.6));
+  row.ticks = ticksBetween(low, high, range / 4);
 }
 
 const toY = (row, value) =>
