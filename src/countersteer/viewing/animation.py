@@ -1,5 +1,6 @@
 """A run seen from above as an animation, GIF or MP4."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -12,9 +13,11 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from countersteer.car.car import wheel_positions
 from countersteer.errors import InputError
+from countersteer.runs.files import Table
 from countersteer.runs.run import Run, drawn_car
 from countersteer.viewing import look, picture
 from countersteer.viewing.style import INK, LINE, PAPER, SLIP_COLOURS, SOFT
+from countersteer.viewing.view import motion_of
 from countersteer.writing import whole
 
 Array = NDArray[np.float64]
@@ -102,17 +105,18 @@ class Animation:
             if "steering_rad" in truth
             else held(self._time, asked["time_s"], asked["steering"])
         )
-        slip = None
-        strips = []
-        if "vx_mps" in truth and "vy_mps" in truth:
-            speed = np.hypot(truth["vx_mps"], truth["vy_mps"])
-            slip = np.where(speed > 0.1, np.arctan2(truth["vy_mps"], truth["vx_mps"]), 0.0)
-            strips.append(Strip("Speed", "{:.1f} m/s", self._time, speed, picture.SPEED))
-            shown = np.degrees(slip)
-            strips.append(Strip("Sideslip", "{:.0f}°", self._time, shown, picture.SIDESLIP))
-        if "yaw_rate_radps" in truth:
-            turning = np.degrees(truth["yaw_rate_radps"])
-            strips.append(Strip("Yaw rate", "{:.0f}°/s", self._time, turning, SOFT))
+        # Motion capture tells poses alone: the velocities are their derivatives, as in the report.
+        shown = motion_of(dataclasses.replace(run, truth=Table(truth)), self._car)
+        strips = [
+            Strip(name, form, shown["time_s"], shown[column], colour)
+            for name, form, column, colour in (
+                ("Speed", "{:.1f} m/s", "speed_mps", picture.SPEED),
+                ("Sideslip", "{:.0f}°", "sideslip_deg", picture.SIDESLIP),
+                ("Yaw rate", "{:.0f}°/s", "yaw_rate_degps", SOFT),
+            )
+            if column in shown
+        ]
+        slip = np.radians(shown["sideslip_deg"]) if "sideslip_deg" in shown else None
         throttle = 100 * asked["throttle"]
         strips.append(Strip("Throttle", "{:.0f} %", asked["time_s"], throttle, SOFT))
         self._strips = strips

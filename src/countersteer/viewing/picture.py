@@ -48,6 +48,7 @@ _STEP_LENGTHS, _CLEARANCE_LENGTHS = 0.4, 0.6
 _SAME_PASS_S, _TURNED_RAD = 1.0, math.radians(20)
 
 _MOST_TURN_NUMBERS = 16
+_TITLE, _LEAST_TITLE = 58, 10.0  # characters that fit at 18 points; points of the smallest
 _DASHES = (3.0, 2.0)
 
 
@@ -116,22 +117,27 @@ def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: fl
     """Write the title, the outcome and the main figures across the top."""
     summary = view["summary"]
     status = str(summary.get("verdict", summary["outcome"]))
-    figure.text(0.022, 0.955, str(view["title"]), color=INK, size=18, weight="bold", va="center")
+    title = str(view["title"])
+    size = max(_LEAST_TITLE, min(18.0, 18.0 * _TITLE / max(len(title), 1)))
+    if len(title) * size > 18 * _TITLE:
+        title = title[: int(18 * _TITLE / size) - 1] + "…"
+    figure.text(0.022, 0.955, title, color=INK, size=size, weight="bold", va="center")
     verdict = status[:1].upper() + status[1:]
     mood = _GOOD if summary.get("success", summary["completed"]) else _BAD
-    if mood == _GOOD and summary.get("drifts", len(summary["turns"])) < len(summary["turns"]):
+    turns = len(summary["turns"])
+    if summary["outcome"] == "not judged" or (
+        mood == _GOOD and summary.get("drifts", turns) < turns
+    ):
         mood = INK
     figure.text(0.022, 0.914, verdict, color=mood, size=13, weight="bold", va="center")
     lap_time, times = summary.get("lap_time_s"), view["time_s"]
     contacts = summary["wall_contacts"]
-    facts = (
-        ("drive time", f"{times[-1] - times[0]:.2f} s")
-        if lap_time is None
-        else ("lap time", f"{lap_time:.2f} s"),
-        ("wall contacts", "–" if contacts is None else f"{contacts}"),
-        ("largest sideslip", f"{largest_sideslip:.0f}°"),
-    )
-    for right, (name, value) in zip((0.718, 0.845, 0.978), facts, strict=True):
+    facts = [("largest sideslip", f"{largest_sideslip:.0f}°")]
+    if contacts is not None:
+        facts.append(("wall contacts", f"{contacts}"))
+    driven = ("drive time", f"{times[-1] - times[0]:.2f} s")
+    facts.append(driven if lap_time is None else ("lap time", f"{lap_time:.2f} s"))
+    for right, (name, value) in zip((0.978, 0.845, 0.718), facts, strict=False):
         bold = figure.text(right, 0.955, value, color=INK, size=17, va="center", ha="right")
         bold.set_fontweight("bold")
         figure.text(right, 0.916, name, color=SOFT, size=10.5, va="center", ha="right")
@@ -258,6 +264,8 @@ def _ghosts(view: dict[str, Any]) -> NDArray[np.intp]:
 
 def _number_turns(axes: "Axes", view: dict[str, Any]) -> None:
     """Write each turn's number on the inside of its middle, unless there are too many turns."""
+    from matplotlib.patheffects import withStroke
+
     turns = view["summary"]["turns"]
     if len(turns) > _MOST_TURN_NUMBERS:
         return
@@ -278,6 +286,7 @@ def _number_turns(axes: "Axes", view: dict[str, Any]) -> None:
         x, y = points[1] + inward / norm * 1.1 * view["car"]["length_m"]
         text = axes.text(x, y, str(number), color=SOFT, size=15, ha="center", va="center")
         text.set(weight="bold", zorder=5)
+        text.set_path_effects([withStroke(linewidth=4, foreground=FLOOR)])
 
 
 def _poses(view: dict[str, Any]) -> Array:
@@ -425,7 +434,8 @@ def _draw_strip(axes: "Axes", strip: _Strip, view: dict[str, Any], is_last: bool
         length=0, labelsize=9.5, labelcolor=SOFT, pad=5, labelbottom=is_last, bottom=is_last
     )
     if is_last:
-        axes.set_xlabel("time, s", color=SOFT, size=9.5, labelpad=3, loc="right")
+        shaded = "shaded: turns      " if view["summary"]["turns"] else ""
+        axes.set_xlabel(f"{shaded}time, s", color=SOFT, size=9.5, labelpad=3, loc="right")
 
 
 def _write_caption(

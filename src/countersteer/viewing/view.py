@@ -40,10 +40,10 @@ def view_of(run: Run) -> dict[str, Any]:
     capture have `x_m`, `y_m` and `heading_rad`. Raises `InputError` if nothing can be drawn.
     """
     car = drawn_car(run.about)
-    simulated = run.truth is not None and {*POSE, *COLUMNS} <= run.truth.keys()
+    simulated = is_simulated(run)
     if run.truth is not None and len(run.truth):
         run = dataclasses.replace(run, truth=known_rows(run))
-    motion = _simulated(run) if simulated else _measured(run, car)
+    motion = motion_of(run, car)
     time = motion["time_s"]
     period = max(PERIOD, float(time[-1] - time[0]) / MOST_SAMPLES)
     own = float(np.median(np.diff(time))) if len(time) > 1 else period
@@ -116,6 +116,19 @@ def known_rows(run: Run) -> Table:
     if not np.any(known):
         raise InputError(f"{run.path}/truth.csv: holds no row of numbers that can be drawn")
     return Table({name: column[known] for name, column in truth.items()})
+
+
+def is_simulated(run: Run) -> bool:
+    """Whether the run tells the whole motion, down to each wheel."""
+    return run.truth is not None and {*POSE, *COLUMNS} <= run.truth.keys()
+
+
+def motion_of(run: Run, car: Car) -> dict[str, np.ndarray]:
+    """Pose, speed, sideslip, yaw rate and voltage over time, as far as the run tells them.
+
+    Sideslip is 0 below 0.5 m/s and backwards. What is unknown at an instant is NaN.
+    """
+    return _simulated(run) if is_simulated(run) else _measured(run, car)
 
 
 def _simulated(run: Run) -> dict[str, np.ndarray]:

@@ -1,6 +1,15 @@
 // Draws lines, areas and texts that are given in metres of the world, through any camera.
 // So each thing is drawn by one function, from above and in perspective.
 
+const SHORT = 8;  // points of a piece of a line that has one width
+
+/** A line in short pieces, each a group of its own. */
+function shortPieces(line) {
+  const pieces = [];
+  for (let i = 0; i < line.length; i += SHORT) pieces.push([line.slice(i, i + SHORT + 1)]);
+  return pieces;
+}
+
 /** A pen on a canvas context (CSS pixels) that looks through a camera. */
 export class Pen {
   constructor(context, camera) {
@@ -45,19 +54,24 @@ export class Pen {
     return this;
   }
 
-  /** Stroke the lines. `wide` is in pixels, `metres` at the first point's depth. */
+  /** Stroke the lines, so many pixels wide, but at least so many metres. */
   stroke(colour, { wide = 1, metres = 0, alpha = 1, dash = [], cap = "round" } = {}) {
-    const c = this.context, first = this.lines[0]?.[0];
-    if (!first) return this;
+    const c = this.context, { camera } = this;
     c.strokeStyle = colour;
     c.globalAlpha = alpha;
-    c.lineWidth = Math.max(wide, metres * this.camera.scaleAt(first[2]));
     c.lineCap = cap;
     c.lineJoin = "round";
     c.setLineDash(dash);
-    c.beginPath();
-    for (const line of this.lines) this.trace(line, false);
-    c.stroke();
+    // In perspective, a line that is wide in metres is narrower farther away, piece by piece.
+    const pieces = metres && camera.perspective;
+    for (const lines of pieces ? this.lines.flatMap(shortPieces) : [this.lines]) {
+      const depth = pieces ? lines[0][lines[0].length >> 1][2] : 1;
+      if (pieces && depth < camera.near) continue;
+      c.lineWidth = Math.max(wide, metres * camera.scaleAt(depth));
+      c.beginPath();
+      for (const line of lines) this.trace(line, false);
+      c.stroke();
+    }
     c.setLineDash([]);
     c.globalAlpha = 1;
     return this;

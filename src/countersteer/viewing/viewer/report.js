@@ -124,6 +124,7 @@ function showChoices() {
   showChoice(part("runs"), focus);
   part("force-key").hidden = !(hasWheels(drives[focus]) && layers.forces);
   part("estimate-key").hidden = !(drives[focus].estimate && layers.estimate);
+  part("ellipse-key").hidden = !(largestOf(drives[focus].estimate?.longer_m ?? []) > 0);
   clock.redraw();
 }
 

@@ -42,13 +42,17 @@ export class Traces {
 
   /** The rows and their lines. Call it again when the drives have grown. */
   measure() {
-    const { drives, axis, theme } = this, alone = drives.length === 1;
+    const { drives, axis } = this, alone = drives.length === 1;
     const ends = drives.filter((one) => one[axis]).map((one) => one[axis]);
     this.whole = [Math.min(...ends.map((x) => x[0])), Math.max(...ends.map((x) => x.at(-1)))];
     this.span = [...this.whole];
     const compared = this.differences && !alone;
     this.rows = QUANTITIES.filter((row) => drives.some((one) => columnOf(one, row)))
-      .map((row) => ({ ...row, lines: compared ? this.differencesIn(row) : this.linesOf(row) }));
+      .map((row) => ({ ...row,
+        // A real car tells what was asked of its servo, and not the angle that came of it.
+        name: drives.some((one) => columnOf(one, row) === row.column) ? row.name
+          : `${row.name} asked`,
+        lines: compared ? this.differencesIn(row) : this.linesOf(row) }));
     if (compared && drives.every((one) => one.x_m)) this.rows.push(this.apart());
     if (compared && axis === "place_m") this.rows.push(this.later());
     this.rows.forEach(scaleRow);
@@ -56,7 +60,6 @@ export class Traces {
       .map((event) => ({ ...event, k })));
     this.turns = axis === "time_s" && alone ? drives[0].summary.turns ?? [] : [];
     this.canvas.style.setProperty("--rows", this.rows.length);
-    void theme;
   }
 
   linesOf(row) {
@@ -67,7 +70,7 @@ export class Traces {
       const scaled = (series) => (row.factor ? series.map((v) => v * row.factor) : series);
       const paint = alone ? { colour: row.colour } : { run: k };
       const lines = [{ x, y: scaled(drive[column]), ...paint, wide: 1.75, area: alone, k,
-        name: column === row.command ? "command" : "actual" }];
+        name: "actual" }];
       if (!alone) return lines;
       if (row.command && column !== row.command && drive[row.command]) {
         lines.push({ x, y: drive[row.command], colour: "ink", wide: 1, dash: [3, 2.5],
@@ -205,6 +208,7 @@ export class Traces {
       c.restore();
       this.drawName(c, row);
     }
+    this.drawKeys(c);
     c.font = theme.font(11);
     c.textAlign = "center"; c.textBaseline = "top";
     c.fillStyle = theme.colour("soft");
@@ -322,28 +326,31 @@ export class Traces {
   }
 
   drawName(c, row) {
-    const keys = row.lines.filter((line) => line.k === undefined || line.k === 0);
-    const shown = keys.length > 1 ? keys : keys.filter((line) => line.name === "command");
-    const x = this.narrow ? this.left : 18, { theme } = this;
-    const middle = this.narrow ? row.top - 9 : (row.top + row.bottom) / 2;
-    const y = this.narrow ? middle : middle - (shown.length ? 15 : 8);
+    const { theme, narrow } = this;
     c.textAlign = "left"; c.textBaseline = "middle";
     c.fillStyle = theme.colour("ink");
     c.font = theme.font(12.5, 600);
-    c.fillText(`${row.name}, ${row.unit}`, x, y);
-    // The key to the lines: at the end of the line of text, or below where there is room.
-    let at = this.narrow ? x + c.measureText(`${row.name}, ${row.unit}`).width + 12 : x;
-    const below = this.narrow ? y : y + 30;
-    c.font = theme.font(10.5);
-    for (const line of shown) {
-      c.strokeStyle = this.paint(line);
-      c.lineWidth = line.dash ? line.wide : 2;
+    c.fillText(`${row.name}, ${row.unit}`, narrow ? this.left : 18,
+      narrow ? row.top - 9 : (row.top + row.bottom) / 2 - 8);
+  }
+
+  /** What the kinds of lines are, where there are several; the colours of runs are on the page. */
+  drawKeys(c) {
+    const kinds = new Map(this.rows.flatMap((row) => row.lines)
+      .filter((line) => line.run === undefined).map((line) => [line.name, line]));
+    if (kinds.size < 2) return;
+    let x = this.narrow ? this.left : 18;
+    const y = this.bottom + 24;
+    Object.assign(c, { font: this.theme.font(11), textAlign: "left", textBaseline: "middle" });
+    for (const [name, line] of kinds) {
+      c.strokeStyle = line.dash ? this.paint(line) : this.theme.colour("soft");
+      c.lineWidth = line.wide;
       c.setLineDash(line.dash ?? []);
-      c.beginPath(); c.moveTo(at, below); c.lineTo(at + 13, below); c.stroke();
+      c.beginPath(); c.moveTo(x, y); c.lineTo(x + 16, y); c.stroke();
       c.setLineDash([]);
-      c.fillStyle = theme.colour("soft");
-      c.fillText(line.name, at + 16, below);
-      at += 24 + c.measureText(line.name).width;
+      c.fillStyle = this.theme.colour("soft");
+      c.fillText(name, x + 20, y);
+      x += 32 + c.measureText(name).width;
     }
   }
 
@@ -373,8 +380,7 @@ export class Traces {
     const { theme, narrow } = this;
     const shown = row.lines.filter((line) => line.k !== undefined)
       .map((line) => ({ line, value: valueAt({ x: line.x, y: line.y }, "y", at, "x") }));
-    const keyed = row.lines.some((line) => line.name === "command") || row.lines.length > shown.length;
-    const middle = narrow ? row.top - 9 : (row.top + row.bottom) / 2 + (keyed ? 0 : 8);
+    const middle = narrow ? row.top - 9 : (row.top + row.bottom) / 2 + 8;
     c.font = theme.font(12.5);
     c.textBaseline = "middle";
     c.textAlign = narrow ? "right" : "left";
