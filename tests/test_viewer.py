@@ -18,7 +18,7 @@ from countersteer.viewing import viewer
 from countersteer.viewing.page import FOLDER as TEMPLATES
 from countersteer.viewing.picture import draw_picture
 from countersteer.viewing.report import pack, report_html
-from countersteer.viewing.side_by_side import differences, places
+from countersteer.viewing.side_by_side import differences, with_places
 from countersteer.viewing.style import PALETTE
 from countersteer.viewing.view import view_of
 
@@ -190,7 +190,7 @@ def test_the_outline_of_a_car_and_the_colours_are_given_in_one_place():
 
 
 def test_a_page_fetches_nothing_and_its_data_cannot_become_markup():
-    page = report_html(made_view(), made_view("other"))
+    page = report_html(*with_places([made_view(), made_view("other")]))
     assert not re.search(r'(src|href)\s*=\s*"', page)
     assert "alert(1)</script>" not in page
     assert page.count("<script") == page.count("</script>") == 2
@@ -226,10 +226,11 @@ def test_lost_commands_of_a_radio_are_the_gaps_between_those_that_came(tmp_path)
 
 def test_at_the_same_place_a_slower_drive_is_later_and_at_the_same_time_it_is_behind():
     quick, slow = made_view("quick", 1.0), made_view("slow", 0.8)
-    own, other = places([quick, slow])
+    both = with_places([quick, slow])
+    own, other = (view["place_m"] for view in both)
     np.testing.assert_allclose(own, quick["time_s"], atol=0.03)  # 1 m/s on a circle of 1 m
     np.testing.assert_allclose(other, 0.8 * slow["time_s"], atol=0.03)
-    (time,), (place,) = (list(differences([quick, slow], by)) for by in ("time", "place"))
+    (time,), (place,) = (list(differences(both, by)) for by in ("time", "place"))
     assert time["speed_mps"]["rms"] == pytest.approx(0.2, abs=0.001)
     assert time["apart_m"]["largest"] == pytest.approx(2 * math.sin(0.2), abs=0.02)
     assert place["apart_m"]["largest"] < 0.03
@@ -238,7 +239,7 @@ def test_at_the_same_place_a_slower_drive_is_later_and_at_the_same_time_it_is_be
 
 def test_a_second_lap_is_another_place_than_the_first():
     view = made_view(speed=2 * math.pi)  # two laps
-    (own,) = places([view])
+    own = with_places([view])[0]["place_m"]
     assert own[-1] == pytest.approx(4 * math.pi, rel=0.02)
     assert np.all(np.diff(own) >= 0)
 
@@ -369,7 +370,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
                 views = [log("eth", "eth_rccar/train_2.npz")]
             else:
                 views = [log("dart", DART)] + [made_view("simulation")] * (source != "dart")
-            kept[source] = report_html(*views)
+            kept[source] = report_html(*with_places(views))
         return kept[source]
 
     return page

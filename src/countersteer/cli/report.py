@@ -85,7 +85,7 @@ def compare(options: argparse.Namespace) -> int:
     """One page of several runs."""
     from countersteer.runs.run import read_run
     from countersteer.viewing.report import report_html
-    from countersteer.viewing.side_by_side import differences
+    from countersteer.viewing.side_by_side import differences, with_places
     from countersteer.viewing.style import MOST_RUNS
     from countersteer.viewing.view import view_of
     from countersteer.writing import write_whole
@@ -95,7 +95,7 @@ def compare(options: argparse.Namespace) -> int:
         raise InputError(
             f"{len(folders)} runs: at most {MOST_RUNS} are shown side by side (--each)"
         )
-    views = [view_of(read_run(folder)) for folder in folders]
+    views = with_places([view_of(read_run(folder)) for folder in folders])
     page = options.out or folders[0] / f"report-with-{folders[1].resolve().name}.html"
     if page.suffix != ".html":
         raise InputError(f"--out {page}: name a .html file")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from countersteer.viewing.page import filled
-from countersteer.viewing.side_by_side import differences, places
+from countersteer.viewing.side_by_side import differences
 from countersteer.viewing.viewer import bundle
 
 # The steps to which series are rounded: what can be seen on the page. Finer ones make it larger.
@@ -42,14 +42,10 @@ _STEPS_IN_LIMIT = 400
 def report_html(*views: dict[str, Any]) -> str:
     """The page that plays these views of runs (`view.view_of`). It loads no other file.
 
-    Several are side by side: at the same time, or at the same place along the first one's path.
-    Texts of the views are shown as text, whatever they contain.
+    Several are side by side: at the same time or, `with_places`, at the same place along the first
+    one's path. Texts of the views are shown as text, whatever they contain.
     """
     runs = [dict(view) for view in views]
-    if len(runs) > 1:
-        for run, place in zip(runs, places(views), strict=True):
-            if place is not None:
-                run["place_m"] = place
     for run in runs:
         run["wheels"] = [_wheel(wheel) for wheel in run["wheels"]]
     compared = {by: list(differences(views, by)) for by in ("time", "place")}
@@ -98,13 +94,12 @@ def pack(values: np.ndarray, step: float) -> dict[str, Any]:
     known = np.isfinite(values)
     whole = np.round(values[known] / step).astype(np.int64)
     change = np.diff(whole, prepend=0)
-    code = np.zeros(len(values), np.uint64)
-    code[known] = np.where(change >= 0, 2 * change + 1, -2 * change).astype(np.uint64)
-    sevens = np.arange(10, dtype=np.uint64) * np.uint64(7)
-    left = code[:, None] >> sevens  # what is left from each byte on
-    byte = (left & np.uint64(127)).astype(np.uint8)
-    more = np.zeros_like(byte, bool)
-    more[:, :-1] = left[:, 1:] > 0
+    code = np.zeros(len(values), np.int64)
+    code[known] = np.where(change >= 0, 2 * change + 1, -2 * change)
+    longest = max(1, -(-int(np.max(code, initial=1)).bit_length() // 7))  # bytes of a number
+    left = code[:, None] >> (7 * np.arange(longest + 1))  # what is left from each byte on
+    more = left[:, 1:] > 0
+    byte = (left[:, :-1] & 127) | (more << 7)
     used = np.hstack([np.ones((len(code), 1), bool), more[:, :-1]])
-    packed = (byte | (more.astype(np.uint8) << 7))[used]
+    packed = byte[used].astype(np.uint8)
     return {"packed": base64.b64encode(packed.tobytes()).decode(), "step": step}

@@ -14,16 +14,19 @@ QUANTITIES = ("speed_mps", "sideslip_deg", "yaw_rate_degps", "steering_deg")
 View = Mapping[str, Any]
 
 
-def places(views: Sequence[View]) -> list[np.ndarray | None]:
-    """The place (m) along the first view's path at each sample of each view; it never falls.
+def with_places(views: Sequence[View]) -> list[dict[str, Any]]:
+    """The views with `place_m`, the place along the first one's path; it never falls.
 
-    It is None where a view has no path, and for all if the first has none.
+    A view without a path has none, and no view has one if the first has no path.
     """
     first = _points(views[0])
     if first is None:
-        return [None] * len(views)
-    path = first[_apart(first)]
-    return [None if (p := _points(view)) is None else _along(path, p) for view in views]
+        return [dict(view) for view in views]
+    path, found = first[_apart(first)], []
+    for view in views:
+        points = _points(view)
+        found.append(dict(view) | ({} if points is None else {"place_m": _along(path, points)}))
+    return found
 
 
 def _points(view: View) -> np.ndarray | None:
@@ -46,22 +49,23 @@ def _along(path: np.ndarray, points: np.ndarray) -> np.ndarray:
     So a course that is driven again, or that crosses itself, has different places on each pass.
     """
     path = np.vstack([_beyond(path[0], path[1:2]), path, _beyond(path[-1], path[-2:-1])])
-    edges = np.hypot(*np.diff(path, axis=0).T)
-    mark = np.concatenate([[0.0], np.cumsum(edges)]) - BEYOND
-    found, at = np.zeros(len(points)), -BEYOND
-    moved = np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)
-    for i, point in enumerate(points):
-        low = int(np.clip(np.searchsorted(mark, at - BACK) - 1, 0, len(path) - 2))
-        high = int(np.searchsorted(mark, at + moved[i] + (AHEAD if i else BEYOND)))
-        near = path[low : high + 2]
+    mark = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))]) - BEYOND
+    chosen, at, found = _apart(points), -BEYOND, []
+    thinned = points[chosen]
+    moved = np.hypot(*np.diff(thinned, axis=0, prepend=thinned[:1]).T).tolist()
+    for i, point in enumerate(thinned):
+        low, high = np.searchsorted(mark, [at - BACK, at + moved[i] + (AHEAD if i else BEYOND)])
+        low = min(max(int(low) - 1, 0), len(path) - 2)
+        near = path[low : int(high) + 2]
         along = np.diff(near, axis=0)
-        square = np.maximum(np.sum(along**2, axis=1), 1e-12)
-        part = np.clip(np.sum((point - near[:-1]) * along, axis=1) / square, 0, 1)
-        away = np.hypot(*(near[:-1] + part[:, None] * along - point).T)
+        square = np.maximum((along**2).sum(axis=1), 1e-12)
+        part = ((point - near[:-1]) * along).sum(axis=1) / square
+        part = np.minimum(np.maximum(part, 0.0), 1.0)
+        away = ((near[:-1] + part[:, None] * along - point) ** 2).sum(axis=1)
         best = int(np.argmin(away))
         at = max(at, float(mark[low + best] + part[best] * np.sqrt(square[best])))
-        found[i] = at
-    return found
+        found.append(at)
+    return np.interp(np.arange(len(points)), chosen, found)
 
 
 def _beyond(end: np.ndarray, inner: np.ndarray) -> np.ndarray:
@@ -74,16 +78,13 @@ def _beyond(end: np.ndarray, inner: np.ndarray) -> np.ndarray:
 def differences(views: Sequence[View], by: str) -> Iterator[dict[str, Any]]:
     """For each view but the first: root mean square and largest difference from the first.
 
-    `by` is `time` or `place`. Each is over what both have. `apart_m` is the distance of the cars;
+    `by` is `time` or, of views `with_places`, `place`. Each is over what both have. `apart_m` is the distance of the cars;
     by place, `later_s` is how much later the other one is at the last common place.
     """
-    axis = {"time": "time_s", "place": "place_m"}[by]
-    place = places(views)
-    whole = [dict(view) | {"place_m": p} for view, p in zip(views, place, strict=True)]
-    first = whole[0]
-    for other in whole[1:]:
+    axis, first = {"time": "time_s", "place": "place_m"}[by], views[0]
+    for other in views[1:]:
         found: dict[str, Any] = {"run": other["name"], "by": by}
-        if first[axis] is not None and other[axis] is not None:
+        if axis in first and axis in other:
             low, high = (f([first[axis][k], other[axis][k]]) for k, f in ((0, max), (-1, min)))
             grid = np.linspace(low, max(low, high), 2000)
             found |= {f"{axis}_from": float(low), f"{axis}_to": float(high)}
