@@ -48,11 +48,13 @@ MAY_IMPORT = {
         "car", "course", "pilot", "task", "runs", "batch", "envs", "link",
         "drivers",  # what is learned is a driver's numbers
         "experiments",  # from which it learns
+        "viewing",  # pictures have one style
     },
     "experiments": {
         "car", "course", "world", "link", "estimation", "pilot", "simulator", "task", "runs",
         "batch", "tuning", "drivers",
         "planning",  # what the planner and the optimum can do
+        "viewing",  # pictures have one style
     },
     "bench": {
         "car", "course", "world", "pilot", "simulator", "batch",

@@ -48,6 +48,7 @@ from countersteer.runs.files import csv_text
 from countersteer.signals import Array, Scalar
 from countersteer.task.judge import DRIFT, Outcome
 from countersteer.task.reward import DRIFTING, Reward
+from countersteer.viewing.style import styled
 from countersteer.writing import whole, write_whole
 
 UNITS = (64, 64)
@@ -530,25 +531,24 @@ def draw(curves: Sequence[dict[str, float]], path: Path, title: str) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    done = [told["samples"] / 1e6 for told in curves]
-    axes = figure.subplots(2, 2).flat
-    for ax, names in zip(
-        axes,
-        (
-            ("success_rate", "drift_share"),
-            ("lap_time_s",),
-            tuple(f"{name}_per_s" for name in ("reward", *Reward._fields)),
-            ("scatter",),
-        ),
-        strict=True,
-    ):
-        for name in names:
-            ax.plot(done, [told[name] for told in curves], label=name)
-        ax.set_xlabel("million decisions")
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
-    figure.suptitle(f"learn ppo: {title}")
-    with whole(path) as part:
+    with styled(), whole(path) as part:
+        figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        done = [told["samples"] / 1e6 for told in curves]
+        axes = figure.subplots(2, 2).flat
+        for ax, names in zip(
+            axes,
+            (
+                ("success_rate", "drift_share"),
+                ("lap_time_s",),
+                tuple(f"{name}_per_s" for name in ("reward", *Reward._fields)),
+                ("scatter",),
+            ),
+            strict=True,
+        ):
+            for name in names:
+                ax.plot(done, [told[name] for told in curves], label=name)
+            ax.set_xlabel("million decisions")
+            ax.legend(fontsize=7)
+        figure.suptitle(f"learn ppo: {title}")
         figure.savefig(part, format="png", dpi=100)

@@ -78,8 +78,9 @@ def _beyond(end: np.ndarray, inner: np.ndarray) -> np.ndarray:
 def differences(views: Sequence[View], by: str) -> Iterator[dict[str, Any]]:
     """For each view but the first: root mean square and largest difference from the first.
 
-    `by` is `time` or, of views `with_places`, `place`. Each is over what both have. `apart_m` is the distance of the cars;
-    by place, `later_s` is how much later the other one is at the last common place.
+    `by` is `time` or, of views `with_places`, `place`. Each is over what both have. `apart_m` is
+    the distance of the cars. By place, `later_s` is how much later the other one is at the last
+    common place.
     """
     axis, first = {"time": "time_s", "place": "place_m"}[by], views[0]
     for other in views[1:]:

@@ -1,6 +1,7 @@
 """The look of pictures: colours, figures, and parts that several pictures share."""
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -87,6 +88,45 @@ def new_figure(width: float, height: float, dpi: int = DPI) -> tuple["Figure", "
 
     figure = Figure(figsize=(width, height), dpi=dpi, facecolor=PAPER)
     return figure, FigureCanvasAgg(figure)
+
+
+@contextlib.contextmanager
+def styled() -> Iterator[None]:
+    """Figures that are made and drawn inside have the colours of the palette, and a light grid."""
+    import matplotlib
+    from cycler import cycler
+
+    runs = [light(f"run-{k + 1}") for k in range(MOST_RUNS)]
+    settings = {
+        "figure.facecolor": PAPER,
+        "savefig.facecolor": PAPER,
+        "axes.facecolor": PAPER,
+        "axes.edgecolor": LINE,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "grid.color": LINE,
+        "grid.linewidth": 0.8,
+        "text.color": INK,
+        "axes.titlecolor": INK,
+        "axes.labelcolor": SOFT,
+        "axes.labelsize": LABEL,
+        "axes.titlesize": 10.5,
+        "xtick.color": LINE,
+        "ytick.color": LINE,
+        "xtick.labelcolor": SOFT,
+        "ytick.labelcolor": SOFT,
+        "xtick.labelsize": LABEL,
+        "ytick.labelsize": LABEL,
+        "axes.prop_cycle": cycler(color=runs),
+        "legend.frameon": False,
+        "legend.labelcolor": INK,
+        "figure.titleweight": "bold",
+        "figure.titlesize": 12.0,
+    }
+    with matplotlib.rc_context(settings):
+        yield
 
 
 def dress(axes: "Axes", size: float = LABEL) -> None:

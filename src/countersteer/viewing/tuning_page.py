@@ -576,8 +576,9 @@ def _spread(values: Numbers) -> float:
 def _digits(value: float, deviation: float) -> tuple[int, int]:
     """The power of ten to factor out of a small number, and decimals that show the deviation."""
     least = next((x for x in (deviation, abs(value) / 100) if math.isfinite(x) and x > 0), 1.0)
-    small = 0 < abs(value) < 1e-3
-    power = math.floor(math.log10(abs(value))) if small else 0
+    # A deviation that is far larger than the value sets the power: 0.000 ± 0.027.
+    largest = max(abs(value), deviation if math.isfinite(deviation) else 0.0)
+    power = math.floor(math.log10(largest)) if 0 < largest < 1e-3 else 0
     return power, min(max(1 - math.floor(math.log10(least)) + power, 0), 6)
 
 

@@ -15,6 +15,8 @@ import { Pen } from "./pen.js";
 
 const CHASED = 0.45, LOOKS = 9;  // s of the past whose mean heading the camera has, in so many looks
 
+const NARROW_STAGE = 480;  // px
+
 export class Stage {
   /** Of drives on one floor. `layers` says by name what is shown; its owner may change it. */
   constructor(canvas, drives, theme, layers) {
@@ -84,7 +86,8 @@ export class Stage {
     const hides = camera.perspective || camera.scale * tall > 1.25 * size.height
       || camera.scale * wide > 1.25 * size.width;
     if (!hides) return;
-    const scale = Math.min(size.width, size.height) * 0.25 / Math.max(wide, tall);
+    const part = size.width < NARROW_STAGE ? 0.19 : 0.25;
+    const scale = Math.min(size.width, size.height) * part / Math.max(wide, tall);
     // The map makes way for the car, and stays where it is as long as it can.
     const at = camera.perspective ? 0
       : camera.pixel(moments[focus].x - camera.x, moments[focus].y - camera.y)[0];
