@@ -23,7 +23,7 @@ COVARIANCE = ("xx_m2", "xy_m2", "yy_m2")  # of the place; zeros: unknown
 ESTIMATE = (
     "time_s", "x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps", *COVARIANCE,
 )  # fmt: skip
-# Places on each path that a planner looked at, one path after the other.
+# Places on each path that a planner looked at, one path after the other; 0 is its plan.
 ROLLOUTS = ("time_s", "rollout", "cost", "x_m", "y_m")
 LARGEST_STEERING = 90.0  # degrees
 LATEST = 1e6  # s, of a time; a clock of Unix time is beyond

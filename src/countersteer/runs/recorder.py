@@ -195,8 +195,10 @@ class Recorder:
         self._mcap = McapWriter(folder / "run.mcap", about, text, headers)
         self._summary: dict[str, Any] | None = None
 
-    def record(self, frames: Frames) -> None:
-        """Append frames as rows of all three tables."""
+    def record(
+        self, frames: Frames, beside: Mapping[str, Sequence[np.ndarray]] | None = None
+    ) -> None:
+        """Append frames as rows of their tables, and rows of other tables from the same time."""
         assert self._channels is not None, "frames need channels"
         assert self._pace is not None, "frames need a pace"
         pace, tick = self._pace, np.asarray(frames.tick)
@@ -232,7 +234,7 @@ class Recorder:
             tables["truth"] = [np.asarray(column)[shown] for column in (time, *frames.truth)]
         if frames.estimate is not None and "estimate" in self._tables:
             tables["estimate"] = [np.asarray(c)[shown] for c in (time, *frames.estimate)]
-        self.write(tables)
+        self.write(tables | dict(beside or {}))
 
     def write(self, tables: Mapping[str, Sequence[np.ndarray]]) -> None:
         """Append a piece: columns by table, in the order of its header.

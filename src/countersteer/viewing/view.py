@@ -244,7 +244,7 @@ def _event(kind: str, label: str, begin: float, end: float) -> dict[str, Any]:
 
 
 def planned(run: Run) -> list[dict[str, Any]]:
-    """The planner's rollouts: for each decision its time (s), the paths and their costs."""
+    """What the planner looked at: its time (s), and paths with costs, of which 0 is the plan."""
     table, found = run.rollouts, []
     if table is None or not len(table):
         return []

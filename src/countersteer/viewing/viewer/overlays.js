@@ -89,16 +89,17 @@ export function drawEstimate(pen, drive, moment, theme) {
   pen.fill(colour, 0.12).stroke(colour, { wide: 1.5 });
 }
 
-/** The paths that the planner looked at last: the cheaper, the darker; the best one is thick. */
+/** The paths that the planner looked at last: the cheaper, the darker; its plan is thick. */
 export function drawRollouts(pen, drive, moment, theme) {
   const at = indexAt(drive.rollouts.map((one) => one.time_s), moment.t);
   if (at < 0 || moment.t - drive.rollouts[at].time_s > STALE) return;
-  const paths = [...drive.rollouts[at].paths].sort((a, b) => b.cost - a.cost);
-  paths.forEach((path, k) => {
-    const cheap = (k + 1) / paths.length, best = k === paths.length - 1;
+  const [plan, ...paths] = drive.rollouts[at].paths;
+  const draw = (path, colour, wide, alpha) => {
     pen.begin();
     path.x_m.forEach((x, i) => pen.to(x, path.y_m[i]));
-    pen.stroke(theme.colour(best ? "velocity" : "force"),
-      { wide: best ? 2.5 : 1, alpha: best ? 1 : 0.1 + 0.5 * cheap });
-  });
+    pen.stroke(theme.colour(colour), { wide, alpha });
+  };
+  paths.sort((a, b) => b.cost - a.cost).forEach((path, k) =>
+    draw(path, "force", 1.25, 0.12 + 0.6 * (k + 1) / paths.length));
+  if (plan) draw(plan, "velocity", 3, 1);
 }
