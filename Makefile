@@ -7,7 +7,7 @@ READY := .venv/ready
 # What a drive needs; `make test` and the rest add to it. Modules are compiled when they are imported.
 DRIVES := .venv/drives
 
-.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook sb3 clean
+.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook sb3 browser clean
 
 drive: $(DRIVES)
 	$(BIN)/countersteer drive box
@@ -48,6 +48,11 @@ bench: $(READY)
 sb3: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--constraint constraints.txt --editable '.[dev,sb3]'
+
+# A test opens the report in Chromium, which has to be there; it skips without either.
+browser: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints.txt --editable '.[dev,browser]'
 
 # Jupyter is some thirty packages: only who changes the notebook needs it.
 notebook: $(READY)

@@ -123,6 +123,7 @@ function showChoices() {
   showChoice(part("shown"), alignment.differences ? "differences" : "values");
   showChoice(part("runs"), focus);
   part("force-key").hidden = !(hasWheels(drives[focus]) && layers.forces);
+  part("rollout-key").hidden = !(drives[focus].rollouts?.length && layers.rollouts);
   part("estimate-key").hidden = !(drives[focus].estimate && layers.estimate);
   part("ellipse-key").hidden = !(largestOf(drives[focus].estimate?.longer_m ?? []) > 0);
   clock.redraw();
@@ -232,8 +233,8 @@ setPlaying(false);
 setFocus(0);
 showDifferences();
 clock.goTo(startingTime(drives[0]));
-new ResizeObserver(fitWindow).observe(document.querySelector(".page"));
-new ResizeObserver(fitWindow).observe(document.querySelector(".floor"));
+const watch = new ResizeObserver(fitWindow);  // one for both: it answers once
+for (const box of [".page", ".floor"]) watch.observe(document.querySelector(box));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   theme.read();
   fitWindow();
