@@ -7,7 +7,7 @@ READY := .venv/ready
 # What a drive needs; `make test` and the rest add to it. Modules are compiled when they are imported.
 DRIVES := .venv/drives
 
-.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook sb3 bags clean
+.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook sb3 bags browser clean
 
 drive: $(DRIVES)
 	$(BIN)/countersteer drive box
@@ -53,6 +53,10 @@ sb3: $(READY)
 bags: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--constraint constraints.txt --editable '.[dev,bags]'
+# A test opens the report in Chromium, which has to be there; it skips without either.
+browser: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints.txt --editable '.[dev,browser]'
 
 # Jupyter is some thirty packages: only who changes the notebook needs it.
 notebook: $(READY)

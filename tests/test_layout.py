@@ -24,7 +24,10 @@ MAY_IMPORT = {
     "drivers": {"car", "course", "estimation", "world"},  # the motor's law, for feed-forward
     "planning": {"car", "course", "world", "drivers"},
     "pilot": {"car", "course", "link", "estimation", "drivers"},  # and not the world
-    "simulator": {"car", "course", "world", "sensing", "link", "drivers", "pilot"},
+    "simulator": {
+        "car", "course", "world", "sensing", "link", "drivers", "pilot",
+        "estimation",  # the estimate is in the record
+    },
     "task": {"car", "course"},
     "runs": {"car", "course"},
     "tuning": {"car", "world", "sensing", "runs"},
@@ -45,11 +48,13 @@ MAY_IMPORT = {
         "car", "course", "pilot", "task", "runs", "batch", "envs", "link",
         "drivers",  # what is learned is a driver's numbers
         "experiments",  # from which it learns
+        "viewing",  # pictures have one style
     },
     "experiments": {
         "car", "course", "world", "link", "estimation", "pilot", "simulator", "task", "runs",
         "batch", "tuning", "drivers",
         "planning",  # what the planner and the optimum can do
+        "viewing",  # pictures have one style
     },
     "bench": {
         "car", "course", "world", "pilot", "simulator", "batch",

@@ -1,6 +1,7 @@
 """One drive from start to goal, recorded as it goes."""
 
 import contextlib
+import dataclasses
 import signal
 import sys
 import threading
@@ -16,11 +17,13 @@ from countersteer.car.car import Car
 from countersteer.car.files import car_tables, load_car
 from countersteer.course.course import Course
 from countersteer.course.files import course_tables
+from countersteer.drivers.driver import ROUNDING, Observation, Status, status_of
 from countersteer.drivers.registry import make_driver
 from countersteer.drivers.replay import SpeedReplay
+from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
-from countersteer.runs.files import read_commands
+from countersteer.runs.files import COVARIANCE, ESTIMATE, ROLLOUTS, read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
 from countersteer.runs.run import refuse_uncontrolled
 from countersteer.sensing.all_sensors import channels
@@ -30,6 +33,7 @@ from countersteer.simulator import PIECE, Record, Simulator
 from countersteer.task.judge import PERIOD, Outcome, Sample, Task, samples, summary
 from countersteer.world.floor import Floor, floor_tables
 
+LOOK, LOOKED_AT, THINNED = 0.1, 24, 2  # s between notes; paths of each; one knot in so many
 VELOCITY = ("vx_mps", "vy_mps", "yaw_rate_radps")
 
 
@@ -163,6 +167,53 @@ def pace_of(simulator: Simulator) -> Pace:
     return Pace(simulator.dt, ticks.telemetry, truth, ticks.onboard)
 
 
+class Watched:
+    """A planner as a driver that also notes what it looks at, once in `LOOK` seconds."""
+
+    def __init__(self, driver: Any) -> None:
+        """Raises `InputError` if the driver plans nothing."""
+        if not hasattr(driver, "rollouts"):
+            raise InputError("--rollouts: this driver looks at no paths; mppi does")
+        self.driver, self.period = driver, driver.period
+        self._next = 0.0
+        self._seen: list[tuple[float, Any]] = []
+
+    def reset(self, key: jax.Array) -> Any:
+        """As the planner."""
+        return self.driver.reset(key)
+
+    def act(self, memory: Any, observation: Observation) -> Any:
+        """As the planner."""
+        time = float(observation.time)
+        if time >= self._next - ROUNDING:
+            self._next = time + LOOK
+            self._seen.append((time, self.driver.rollouts(memory, observation, LOOKED_AT)))
+        return self.driver.act(memory, observation)
+
+    def status(self, memory: Any) -> Status:
+        """As the planner."""
+        return status_of(self.driver, memory)
+
+    def columns(self, until: float) -> list[np.ndarray]:
+        """Columns of `ROLLOUTS` for what was noted up to a time (s) and not yet returned."""
+        rows: list[np.ndarray] = []
+        while self._seen and self._seen[0][0] <= until:
+            time, seen = self._seen.pop(0)
+            paths = [(np.nanmin(seen.cost), seen.plan.x, seen.plan.y)]
+            paths += list(zip(seen.cost, seen.motion.x, seen.motion.y, strict=True))
+            for k, (cost, x, y) in enumerate(paths):
+                at = np.arange(0, len(x), THINNED)
+                known = np.full(len(at), time), np.full(len(at), k), np.full(len(at), cost)
+                rows.append(np.stack([*known, np.round(x[at], 4), np.round(y[at], 4)]))
+        return list(np.hstack(rows)) if rows else [np.zeros(0)] * len(ROLLOUTS)
+
+
+def watched(what: Drive) -> Drive:
+    """The same drive, with what its planner looks at. Raises `InputError` if it does not plan."""
+    pilot = dataclasses.replace(what.pilot, driver=Watched(what.pilot.driver))
+    return what._replace(pilot=pilot)
+
+
 class Interrupt:
     """Notes a Ctrl-C during a drive, so that the drive ends between two pieces.
 
@@ -206,9 +257,15 @@ def drive(
     laps = int(about["laps"])
     task, pace = Task.of(course, laps), pace_of(simulator)
     score, outcome = task.init(), Outcome.DRIVING
-    command = getattr(pilot.driver, "command_type", Command)
+    # Who plays commands looks at no estimate, and the ground truth is recorded already.
+    known = about["pilot"].get("kind") == "replay" or about["estimate"] == "truth"
+    more = {} if known else {"estimate": ESTIMATE}
+    planner = pilot.driver if isinstance(pilot.driver, Watched) else None
+    if planner is not None:
+        more["rollouts"] = ROLLOUTS
+    sensors, command = channels(simulator.car), getattr(pilot.driver, "command_type", Command)
     with Recorder(
-        folder, about, channels=channels(simulator.car), pace=pace, command=command
+        folder, about, channels=sensors, pace=pace, command=command, more=more
     ) as recorder:
         with (
             Interrupt() as interrupt,
@@ -222,7 +279,10 @@ def drive(
                 over = np.nonzero(outcomes != Outcome.DRIVING.code)[0]
                 end = int(shown[over[0]]) + 1 if len(over) else len(record.tick)
                 last = np.searchsorted(record.tick * simulator.dt, longest + 1e-9, side="right")
-                recorder.record(frames(record, min(end, int(last))))
+                shot = frames(record, min(end, int(last)))
+                until = float(shot.tick[-1]) * simulator.dt if len(shot.tick) else -1.0
+                seen = {} if planner is None else {"rollouts": planner.columns(until)}
+                recorder.record(shot, seen)
                 if task.line is not None:
                     report(float(score.distance), float(task.goal))
                 else:
@@ -252,6 +312,8 @@ def warm_up(what: Drive) -> None:
 def frames(record: Record, end: int) -> Frames:
     """The frames of the first `end` rows of a record, for the recorder."""
     truth = truth_columns(record.motion, record.voltage)
-    whole = Frames(record.tick, record.readings, record.command, record.fresh, truth)
+    known = record.estimate
+    estimate = known and (*known[:6], *(getattr(known.pose_covariance, k[:2]) for k in COVARIANCE))
+    whole = Frames(record.tick, record.readings, record.command, record.fresh, truth, estimate)
     cut: Frames = jax.tree.map(lambda leaf: leaf[:end], whole)
     return cut

@@ -24,6 +24,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Status
+from countersteer.estimation.estimate import Estimate
 from countersteer.kept_programs import kept
 from countersteer.link.link import ONBOARD, Link, Packets, exchange, initial_packets
 from countersteer.pilot import Pilot, PilotMemory
@@ -71,6 +72,7 @@ class Record(NamedTuple):
     wall_contacts: Scalar
     rolled_over: Scalar
     status: Status  # the driver's status at its start
+    estimate: Estimate | None = None  # the pilot's at its start; None: there was no pilot
 
 
 @pytree
@@ -310,12 +312,12 @@ def tick(
     def act(memory: PilotMemory) -> PilotMemory:
         return pilot.act(memory, heard(simulator, loop), loop.tick)[1]
 
-    status = pilot.status(memory)
+    status, estimate = pilot.status(memory), pilot.estimate(memory)
     # Traced even if each tick has a decision: code compiled apart gives the same digits.
     now = loop.tick % pilot.control == 0 if pilot.control > 1 else loop.tick >= 0
     memory = jax.lax.cond(now, act, lambda same: same, memory)
     loop, record = advance(simulator, loop, memory.command, now)
-    return loop, memory, record._replace(status=status)
+    return loop, memory, record._replace(status=status, estimate=estimate)
 
 
 @kept(2)
@@ -338,15 +340,16 @@ def steps(
     """`scan` for any pilot, one decision at a time."""
     records = []
     for _ in range(ticks // pilot.control):
-        status = pilot.status(memory)
+        before = pilot.status(memory), pilot.estimate(memory)
         command, memory = pilot.act(memory, simulator.readings(loop), loop.tick)
         loop, record = simulator.apply(loop, command, pilot.control)
-        status = jax.tree.map(
+        status, estimate = jax.tree.map(
             lambda before, after: np.array([before, *[after] * (pilot.control - 1)]),
-            status,
-            pilot.status(memory),
+            before,
+            (pilot.status(memory), pilot.estimate(memory)),
         )
-        records.append(jax.tree.map(np.asarray, record)._replace(status=status))
+        kept = jax.tree.map(np.asarray, record)
+        records.append(kept._replace(status=status, estimate=estimate))
     return loop, memory, jax.tree.map(lambda *parts: np.concatenate(parts), *records)
 
 

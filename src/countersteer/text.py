@@ -37,6 +37,11 @@ def read_toml(name: str, shelf: Any, kind: str, files: str = ".toml") -> tuple[d
     )
 
 
+def counted(number: int, noun: str) -> str:
+    """`1 turn`, `2 turns`."""
+    return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """` (did you mean …?)`, where one of the known words is like it."""
     found = difflib.get_close_matches(word[:100], list(known), n=1, cutoff=0.6)

@@ -5,6 +5,7 @@ import contextlib
 import gc
 import logging
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Sequence
@@ -77,6 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     try:
         options = top.parse_args(given)
+        options.command = shlex.join([top.prog, *given])
         told = options.verb in LONG and not options.json
         wait = waiting(_title(options), cache_folder() / "waits.json")
         with wait if told else contextlib.nullcontext():

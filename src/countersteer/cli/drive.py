@@ -45,6 +45,8 @@ def add(verbs: Verbs) -> None:
         "seconds, such as 'gyroscope stuck 2.0 0.5' (repeatable)"
     )
     drive.option("--fault", "TEXT", str, [], meaning, action="append")
+    meaning = "record the paths that a planner looks at too, for the report (slower)"
+    drive.add_argument("--rollouts", action="store_true", help=meaning)
     laps_and_link(drive)
 
 
@@ -55,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     from countersteer.course.files import load_course
     from countersteer.drivers.policy import for_another_car
     from countersteer.link.link import LINKS
-    from countersteer.recorded_drive import prepare
+    from countersteer.recorded_drive import prepare, watched
     from countersteer.sensing.faults import read_fault
 
     course, car = load_course(options.course), load_car(options.car, options.set)
@@ -89,6 +91,8 @@ def run(options: argparse.Namespace) -> int:
     note = for_another_car(drive.about["pilot"], options.car)
     if note:
         complain(note)
+    if options.rollouts:
+        drive = watched(drive)
     return record(options, drive, course.name)
 
 

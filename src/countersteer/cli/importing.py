@@ -28,12 +28,15 @@ def run(options: argparse.Namespace) -> int:
     """`import`."""
     if options.guess:
         return guess(options)
+    from countersteer.cli.report import report_of_import
+
     to_run = importer(options.format, options.map)
     results: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
     for file in options.files:
         try:
-            results.append(to_run(file, options.out))
+            result = to_run(file, options.out)
+            results.append(result | report_of_import(Path(result["run"])))
         except InputError as error:  # a bad log does not keep the others from being imported
             failed.append({"file": str(file), "error": one_line(error)})
             continue

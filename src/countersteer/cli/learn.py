@@ -75,6 +75,7 @@ def learn_stop_angle(options: argparse.Namespace) -> int:
     """The regression over turns that were stopped."""
     from countersteer.experiments import stop_regression
     from countersteer.learning.stop_angle import learn
+    from countersteer.text import counted
     from countersteer.writing import whole, write_whole
 
     picture = options.out.with_suffix(".png")
@@ -82,7 +83,9 @@ def learn_stop_angle(options: argparse.Namespace) -> int:
         found = learn(options.sources, math.radians(options.most_deg), policy)
         result = stop_regression.about(found)
         names = ", ".join(path.name for path in options.sources)
-        stop_regression.draw(found, drawn, f"{result['turns']} turns of {names}"[:90])
+        stop_regression.draw(
+            found, drawn, f"{counted(result['turns'], 'stopped turn')} (from {names})"[:90]
+        )
         write_whole(options.out.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
     if options.json:
         print(json.dumps(result | {"policy": str(options.out), "picture": str(picture)}))

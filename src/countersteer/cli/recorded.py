@@ -28,8 +28,17 @@ def record(options: argparse.Namespace, what: "Drive", place: str) -> int:
     """Drives, writes the run's folder with its pictures, and prints what came of it."""
     from countersteer.runs.recorder import new_folder
 
+    what.about.update(made_by(options))
     with new_folder(options.out, f"{Path(place).stem}-{what.about['driver']}") as folder:
         return record_into(folder, options, what)
+
+
+def made_by(options: argparse.Namespace) -> dict[str, str]:
+    """The command, for a run's `run.toml`, if it is one that reads well there."""
+    from countersteer.runs.keys import LONGEST_TEXT
+
+    command = str(options.command)
+    return {"command": command} if command.isprintable() and len(command) < LONGEST_TEXT else {}
 
 
 def record_into(folder: Path, options: argparse.Namespace, what: "Drive") -> int:

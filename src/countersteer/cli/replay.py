@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,6 +91,7 @@ def replayed(options: argparse.Namespace, run: "Run | None", car: "Car", name: s
     pose, velocity = read_initial(options.initial)
     if run is not None and not options.initial:
         begin = run.about.get("start") or run.about.get("course", {}).get("start")
+        begin = begin or measured_start(run)
         if begin:
             pose = (begin["x_m"], begin["y_m"], begin["heading_rad"])
         first = run.about.get("initial", {})
@@ -122,6 +124,15 @@ def replayed(options: argparse.Namespace, run: "Run | None", car: "Car", name: s
     longest, laps = float(times[-1]) + last, int(run.about.get("laps", 1)) if run else 1
     about = about_run(simulator, pilot, course, "replay", name, laps, car, {"kind": "replay"})
     return Drive(simulator, pilot, course, about, longest)
+
+
+def measured_start(run: "Run") -> dict[str, float] | None:
+    """The first pose that was measured of a real car; None without."""
+    names = ("x_m", "y_m", "heading_rad")
+    poses = zip(*(run.truth[name].tolist() for name in names), strict=True) if run.truth else ()
+    known = (pose for pose in poses if all(map(math.isfinite, pose)))
+    first = next(known, None)
+    return first and dict(zip(names, first, strict=True))
 
 
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:

@@ -187,5 +187,5 @@ def _paint(
     right.boxplot(shown, positions=place, orientation="horizontal", widths=0.6, sym=".")
     right.set_yticks(place, [""] * len(errors))
     right.axvline(0, color="grey", linewidth=0.8)
-    right.set_xlabel("heading error of turns that ended, °")
+    right.set_xlabel("heading error of turns that ended, ° (box: half of them, dots: outliers)")
     figure.suptitle(f"control-rate: {name}, {trials} trials each")

@@ -114,7 +114,9 @@ def _found(car: Car, name: str, lock: np.ndarray, speed: np.ndarray, peak: np.nd
     def paint(figure: Any) -> None:
         ax = figure.subplots()
         dots = ax.scatter(energy, np.degrees(peak), c=np.degrees(lock), s=16)
-        ax.axhline(math.degrees(DRIFT), color="grey", linewidth=0.8)
+        words = f"a drift: over {math.degrees(DRIFT):.0f}°"
+        ax.axhline(math.degrees(DRIFT), color="grey", linewidth=0.8, label=words)
+        ax.legend(fontsize=8)
         ax.set_xlabel("kinetic energy as the wheels turn over, J")
         ax.set_ylabel("peak sideslip, °")
         figure.colorbar(dots, ax=ax, label="wheel angle, °")

@@ -128,7 +128,7 @@ def _found(name: str, series: Series, more: dict[str, np.ndarray]) -> Result:
             ax.axvline(stop.duration, color="grey", lw=0.8, ls=":")
             ax.set_ylabel(label)
             ax.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
-        rows[-1].set_xlabel("time from the kill, s (dotted: stopped)")
+        rows[-1].set_xlabel("time from the kill, s (grey: the kill, dotted: stopped)")
         figure.suptitle(f"drift-turn: {name}")
 
     return Result(table, figures, text, paint, (9.0, 8.0))

@@ -176,4 +176,4 @@ def paint_stops(
             )
         ax.set_xlabel("yaw rate at the kill, °/s")
         ax.set_ylabel(label)
-    axes[1].legend(frameon=False, fontsize=8, title="forward speed", title_fontsize=8)
+    axes[1].legend(frameon=False, fontsize=8, title="forward speed (turns)", title_fontsize=8)

@@ -256,7 +256,7 @@ def _paint(
         if not math.isnan(width):
             left.axvline(width, color=colour, linewidth=0.8, linestyle=":")
             _draw_track(ax, car, width, tracks[slides])
-    left.set_xlabel("width of the corridor, m")
+    left.set_xlabel("width of the corridor, m (dotted: the narrowest)")
     left.set_ylabel("best time between the gates, s")
     left.set_ylim(bottom=0)
     left.legend(frameon=False)

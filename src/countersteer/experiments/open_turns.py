@@ -23,6 +23,7 @@ from countersteer.runs.files import Table, csv_text, read_table
 from countersteer.runs.run import Run, drawn_car, read_run
 from countersteer.task.turns import sideslip
 from countersteer.tuning.windows import find_references, read_measured
+from countersteer.viewing.style import styled
 from countersteer.writing import whole, write_whole
 
 ON, OFF = 0.05, 0.02  # throttle that drives (above), and throttle that does not (up to)
@@ -267,6 +268,7 @@ def read_turns(path: Path) -> Table:
     return table
 
 
+@styled()
 def draw_turns(table: Table, path: Path, title: str) -> None:
     """Draw time and angle to the stop over the yaw rate at the kill, coloured by speed."""
     import matplotlib

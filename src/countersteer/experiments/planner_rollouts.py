@@ -85,7 +85,7 @@ def simulate(car: Car, name: str, report: Report = silent) -> Result:
             ax.plot(seen.plan.x, seen.plan.y, color="tab:red", lw=1.8, label="plan")
             ax.plot(*track, color="k", lw=0.7, ls="--", label="driven")
             at = round(time * 1000)
-            ax.plot(*track[:, at], "ko", ms=4)
+            ax.plot(*track[:, at], "ko", ms=4, label="car")
             ax.set_xlim(track[0, at] - 1.7, track[0, at] + 1.7)
             ax.set_ylim(track[1, at] - 1.7, track[1, at] + 1.7)
             ax.set_aspect("equal")

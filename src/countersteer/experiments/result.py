@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from countersteer.runs.files import csv_text
+from countersteer.viewing.style import styled
 from countersteer.writing import whole, write_whole
 
 Report = Callable[[int, int], None]
@@ -36,9 +37,13 @@ def write(found: Result, folder: Path, name: str) -> dict[str, Any]:
 
     result = {"experiment": name, **found.figures, "text": found.text}
     rows = zip(*found.table.values(), strict=True)
-    figure = plt.figure(figsize=found.size, layout="constrained")
-    found.draw(figure)
-    with whole(folder / "summary.json") as summary, whole(folder / f"{name}.png") as picture:
+    with (
+        styled(),
+        whole(folder / "summary.json") as summary,
+        whole(folder / f"{name}.png") as picture,
+    ):
+        figure = plt.figure(figsize=found.size, layout="constrained")
+        found.draw(figure)
         write_whole(folder / f"{name}.csv", csv_text(list(found.table), rows))
         figure.savefig(picture, format="png", dpi=110)
         text = json.dumps(result, indent=1, ensure_ascii=False) + "\n"

@@ -23,6 +23,8 @@ from countersteer.experiments.local_regression import (
     regress,
 )
 from countersteer.runs.files import Table
+from countersteer.text import counted
+from countersteer.viewing.style import styled
 from countersteer.writing import whole
 
 MOST = math.radians(30)  # largest angle to the stop for which the lines are straight
@@ -124,7 +126,8 @@ def lines(told: dict[str, Any]) -> list[str]:
     """The figures of `about` as lines for a person."""
     errors = told["cross_validated_rms_deg"]
     text = [
-        f"{told['turns']} turns, {len(told['regions'])} regions by {told['chosen_by']} (rms "
+        f"{counted(told['turns'], 'turn')}, {counted(len(told['regions']), 'region')} by "
+        f"{told['chosen_by']} (rms "
         + ", ".join(f"{count}: {error:.2f}°" for count, error in errors.items())
         + ")"
     ]
@@ -165,9 +168,9 @@ def draw(found: Stops, path: Path, title: str) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(10, 4), layout="constrained")
-    paint(found, figure)
-    figure.suptitle(title)
-    with whole(path) as part:
+    with styled(), whole(path) as part:
+        figure = plt.figure(figsize=(10, 4), layout="constrained")
+        paint(found, figure)
+        figure.suptitle(title)
         figure.savefig(part, format="png", dpi=110)
     plt.close(figure)

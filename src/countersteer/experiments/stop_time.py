@@ -12,6 +12,7 @@ from countersteer.experiments.open_turns import as_table, of_run, trial
 from countersteer.experiments.result import Report, Result, silent
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run
+from countersteer.text import counted
 
 TRIALS, SPEEDS, CHARGE = 1000, (1.0, 3.0), (0.3, 1.0)
 
@@ -43,8 +44,9 @@ def _found(table: Table, name: str) -> Result:
         else ""
     )
     text = (
-        f"Stopping time over the yaw rate at the kill ({name}): {told['turns']} turns that "
-        f"stopped, in {len(told['regions'])} regions of forward speed (chosen by "
+        f"Stopping time over the yaw rate at the kill ({name}): "
+        f"{counted(told['turns'], 'turn')} that stopped, in "
+        f"{counted(len(told['regions']), 'region')} of forward speed (chosen by "
         f"{told['chosen_by']}): {times}.{ran_on}"
     )
     columns: dict[str, Any] = {key: table[key] for key in table if key not in ("hand", "run")}

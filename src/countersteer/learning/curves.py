@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from countersteer.runs.files import csv_text
+from countersteer.viewing.style import styled
 from countersteer.writing import whole, write_whole
 
 Curves = Sequence[dict[str, float]]
@@ -24,16 +25,15 @@ def save(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
     label, size = unit
     done = [told[along] / size for told in curves]
-    for ax, names in zip(figure.subplots(2, 2).flat, panels, strict=True):
-        for name in names:
-            ax.plot(done, [told[name] for told in curves], label=name)
-        ax.set_xlabel(label)
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
-    figure.suptitle(title)
-    with whole(policy.with_suffix(".png")) as part:
+    with styled(), whole(policy.with_suffix(".png")) as part:
+        figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        for ax, names in zip(figure.subplots(2, 2).flat, panels, strict=True):
+            for name in names:
+                ax.plot(done, [told[name] for told in curves], label=name)
+            ax.set_xlabel(label)
+            ax.legend(fontsize=7)
+        figure.suptitle(title)
         figure.savefig(part, format="png", dpi=100)

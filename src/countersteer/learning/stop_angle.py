@@ -9,6 +9,7 @@ from countersteer.drivers.policy import save_policy
 from countersteer.experiments.open_turns import read_turns
 from countersteer.experiments.stop_regression import Stops, about, regress_stops
 from countersteer.runs.files import Table
+from countersteer.text import counted
 
 
 def learn(sources: Sequence[Path], most: float, out: Path) -> Stops:
@@ -35,7 +36,7 @@ def source(found: Stops, names: Sequence[str]) -> dict[str, str]:
     )
     low, high = told["yaw_rate_degps"]
     return {
-        "stop_angle": f"learned from {told['turns']} turns of {', '.join(names)}",
+        "stop_angle": f"learned from {counted(told['turns'], 'stopped turn')} ({', '.join(names)})",
         "standard_errors": errors,
         "valid": f"yaw rates of {low:.0f} to {high:.0f} °/s at the kill",
         "left_out": f"{told['ran_on']} turns that ran on",

@@ -19,6 +19,13 @@ log = logging.getLogger(__name__)
 
 COMMANDS = ("time_s", "throttle", "direction", "steering_deg")
 SPEED_COMMANDS = ("time_s", "speed_mps", "steering_deg")  # of a car with a speed controller
+COVARIANCE = ("xx_m2", "xy_m2", "yy_m2")  # of the place; zeros: unknown
+# What the pilot takes for its motion, in the axes of the ground truth.
+ESTIMATE = (
+    "time_s", "x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "yaw_rate_radps", *COVARIANCE,
+)  # fmt: skip
+# Places on each path that a planner looked at, one path after the other; 0 is its plan.
+ROLLOUTS = ("time_s", "rollout", "cost", "x_m", "y_m")
 LARGEST_STEERING = 90.0  # degrees
 FASTEST = 100.0  # m/s, of a commanded speed
 LATEST = 1e6  # s, of a time; a clock of Unix time is beyond

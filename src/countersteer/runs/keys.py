@@ -115,6 +115,11 @@ _COURSE = Keys(
     }
 )
 
+_FAULT = {
+    "sensor": _text, "kind": _text, "start_s": _number(0, FARTHEST),
+    "duration_s": _number(0, float("inf")),
+}  # fmt: skip
+
 ABOUT = Keys(
     {
         "car_name": _text,
@@ -156,7 +161,10 @@ ABOUT = Keys(
             }
         ),
         "link": Keys({"name": _text}),
-        "rates": Keys({"dt_s": _number(1e-5, 0.02)}),
+        "rates": Keys({"dt_s": _number(1e-5, 0.02), "control_s": _number(1e-5, 10)}),
+        "command": _text,
+        "source": _text,
+        "faults": _list(Keys(_FAULT, tuple(_FAULT))),
         "floor": Keys(
             {
                 "amplitude": _number(-1, 1),

@@ -58,6 +58,7 @@ class Frames(NamedTuple):
     command: AnyCommand  # of the car from this instant on
     fresh: np.ndarray  # True for a new command
     truth: tuple[np.ndarray, ...] | None = None  # values of `TRUTH`; None: unknown
+    estimate: tuple[np.ndarray, ...] | None = None  # values of `ESTIMATE` but the time
 
 
 @contextlib.contextmanager
@@ -177,11 +178,13 @@ class Recorder:
         channels: Readings | None = None,
         pace: Pace | None = None,
         command: type[AnyCommand] = Command,
+        more: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         """Write `run.toml` and the `headers` of the tables, by name.
 
         Frames need the `channels` of the car's sensors, the `pace`, and the type of `command`.
-        Their headers follow from them.
+        Their headers follow from these, and `more` adds tables: `estimate` for frames that have
+        one, and those that `write` fills.
         """
         self.folder = folder
         self._channels, self._pace = channels, pace
@@ -191,6 +194,7 @@ class Recorder:
             truth = ("time_s", *(channel.name for channel in TRUTH))
             commands = SPEED_COMMANDS if command is SpeedCommand else COMMANDS
             headers = {"commands": commands, "telemetry": ("time_s", *told), "truth": truth}
+            headers |= more or {}
         assert headers is not None
         by_speed = "speed_mps" in headers.get("commands", ())
         self._command_rows = speed_rows if by_speed else command_rows
@@ -202,8 +206,10 @@ class Recorder:
         self._mcap = McapWriter(folder / "run.mcap", about, text, headers)
         self._summary: dict[str, Any] | None = None
 
-    def record(self, frames: Frames) -> None:
-        """Append frames as rows of all three tables."""
+    def record(
+        self, frames: Frames, beside: Mapping[str, Sequence[np.ndarray]] | None = None
+    ) -> None:
+        """Append frames as rows of their tables, and rows of other tables from the same time."""
         assert self._channels is not None, "frames need channels"
         assert self._pace is not None, "frames need a pace"
         pace, tick = self._pace, np.asarray(frames.tick)
@@ -237,7 +243,9 @@ class Recorder:
         self._last = int(tick[-1]) if len(tick) else self._last
         if frames.truth is not None:
             tables["truth"] = [np.asarray(column)[shown] for column in (time, *frames.truth)]
-        self.write(tables)
+        if frames.estimate is not None and "estimate" in self._tables:
+            tables["estimate"] = [np.asarray(c)[shown] for c in (time, *frames.estimate)]
+        self.write(tables | dict(beside or {}))
 
     def write(self, tables: Mapping[str, Sequence[np.ndarray]]) -> None:
         """Append a piece: columns by table, in the order of its header.

@@ -14,7 +14,9 @@ from countersteer.reading.content import read_text, reading
 from countersteer.reading.documents import json_object, toml
 from countersteer.runs.declared import telemetry_in_si, truth_at_centre
 from countersteer.runs.files import (
+    ESTIMATE,
     LONGEST,
+    ROLLOUTS,
     SLOWEST_CLOCK,
     Table,
     drive_column,
@@ -37,6 +39,8 @@ class Run:
     telemetry: Table | None
     truth: Table | None
     summary: dict[str, Any] = dataclasses.field(default_factory=dict)  # summary.json
+    estimate: Table | None = None  # what the pilot took for its motion
+    rollouts: Table | None = None  # paths that a planner looked at
 
     @property
     def car(self) -> Car | None:
@@ -128,6 +132,7 @@ def read_run(path: Path) -> Run:
 def _read(path: Path) -> Run:
     recorded = (path / "run.mcap").exists()  # no table that was written by hand
     telemetry, truth, summary = (path / n for n in ("telemetry.csv", "truth.csv", "summary.json"))
+    estimate, rollouts = path / "estimate.csv", path / "rollouts.csv"
     about = read_about(path / "run.toml")
     pose = ("time_s", "x_m", "y_m", "heading_rad")
     return Run(
@@ -141,4 +146,6 @@ def _read(path: Path) -> Run:
         if truth.exists()
         else None,
         read_summary(summary) if summary.exists() else {},
+        read_measurements(estimate, ESTIMATE, recorded) if estimate.exists() else None,
+        read_measurements(rollouts, ROLLOUTS, recorded) if rollouts.exists() else None,
     )

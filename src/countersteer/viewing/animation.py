@@ -1,5 +1,6 @@
 """A run seen from above as an animation, GIF or MP4."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -12,10 +13,11 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from countersteer.car.car import wheel_positions
 from countersteer.errors import InputError
-from countersteer.runs.files import drive_column
+from countersteer.runs.files import Table, drive_column
 from countersteer.runs.run import Run, drawn_car
-from countersteer.viewing import picture
-from countersteer.viewing.style import INK, LINE, PAPER, SOFT
+from countersteer.viewing import look, picture
+from countersteer.viewing.style import INK, LINE, PAPER, SLIP_COLOURS, SOFT
+from countersteer.viewing.view import motion_of
 from countersteer.writing import whole
 
 Array = NDArray[np.float64]
@@ -103,17 +105,18 @@ class Animation:
             if "steering_rad" in truth
             else held(self._time, asked["time_s"], asked["steering"])
         )
-        slip = None
-        strips = []
-        if "vx_mps" in truth and "vy_mps" in truth:
-            speed = np.hypot(truth["vx_mps"], truth["vy_mps"])
-            slip = np.where(speed > 0.1, np.arctan2(truth["vy_mps"], truth["vx_mps"]), 0.0)
-            strips.append(Strip("Speed", "{:.1f} m/s", self._time, speed, picture.SPEED))
-            shown = np.degrees(slip)
-            strips.append(Strip("Sideslip", "{:.0f}°", self._time, shown, "#c97a10"))
-        if "yaw_rate_radps" in truth:
-            turning = np.degrees(truth["yaw_rate_radps"])
-            strips.append(Strip("Yaw rate", "{:.0f}°/s", self._time, turning, SOFT))
+        # Motion capture tells poses alone: the velocities are their derivatives, as in the report.
+        shown = motion_of(dataclasses.replace(run, truth=Table(truth)), self._car)
+        strips = [
+            Strip(name, form, shown["time_s"], shown[column], colour)
+            for name, form, column, colour in (
+                ("Speed", "{:.1f} m/s", "speed_mps", picture.SPEED),
+                ("Sideslip", "{:.0f}°", "sideslip_deg", picture.SIDESLIP),
+                ("Yaw rate", "{:.0f}°/s", "yaw_rate_degps", SOFT),
+            )
+            if column in shown
+        ]
+        slip = np.radians(shown["sideslip_deg"]) if "sideslip_deg" in shown else None
         if drive_column(asked) == "speed":
             name, unit, drive = "Commanded speed", "{:.1f} m/s", asked["speed"]
         else:
@@ -174,8 +177,8 @@ class Animation:
                 angle = self._steering if k < 2 else 0.0 * vx
                 along = np.cos(angle) * vx + np.sin(angle) * vy - truth[name] * float(tire.radius)
                 sliding = np.hypot(along, np.cos(angle) * vy - np.sin(angle) * vx)
-                full = picture.SKID_FULL_MPS - picture.SKID_FROM_MPS
-                marks[k] = np.clip((at(sliding) - picture.SKID_FROM_MPS) / full, 0, 1)
+                full = look.SKID_FULL_MPS - look.SKID_FROM_MPS
+                marks[k] = np.clip((at(sliding) - look.SKID_FROM_MPS) / full, 0, 1)
         return Trail(time, pose[:, :2], colours, wheels, marks)
 
     def _place(self) -> None:
@@ -252,7 +255,7 @@ class Animation:
         for track, marks in zip(wheels, trail.marks, strict=True):
             for k in range(begin, end):
                 if marks[k] > 0:
-                    dark = picture.SKID_DARKEST * (0.25 + 0.75 * float(marks[k]))
+                    dark = look.SKID_DARKEST * (0.25 + 0.75 * float(marks[k]))
                     colour = mixed(picture.FLOOR, INK, dark)
                     self._stroke(draw, track[k - 1 : k + 1], colour, tire)
         # Marks of the rear tyres cover earlier pieces of the path. So these are drawn again.
@@ -275,9 +278,9 @@ class Animation:
 
         half = np.array([float(body.length), float(body.width)]) / 2
         centre = np.array([float(body.center), 0.0])
-        fill(picture.BODY * (half + 0.7 / self._scale) + centre, PAPER)
-        fill(picture.BODY * half + centre, PAINT)
-        for window in (picture.WINDSCREEN, picture.REAR_WINDOW):
+        fill(look.BODY * (half + 0.7 / self._scale) + centre, PAPER)
+        fill(look.BODY * half + centre, PAINT)
+        for window in (look.WINDSCREEN, look.REAR_WINDOW):
             fill(window * half + centre, picture.GLASS)
         tread = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
         sizes = (tires.front,) * 2 + (tires.rear,) * 2
@@ -352,7 +355,7 @@ def mixed(one: str, other: str, part: float) -> str:
 
 def ramp(part: float) -> str:
     """The colour of a sideslip of `part` (0 to 1) of the largest, in 32 steps."""
-    calm, middle, wild = picture.SLIP_COLOURS
+    calm, middle, wild = SLIP_COLOURS
     place = round(32 * min(part, 1.0)) / 16
     return mixed(calm, middle, place) if place <= 1 else mixed(middle, wild, place - 1)
 

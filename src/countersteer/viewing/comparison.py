@@ -18,6 +18,7 @@ from countersteer.viewing.style import (
     draw_commands,
     draw_windows,
     dress,
+    light,
     new_figure,
 )
 from countersteer.writing import whole
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SIZE_IN = (14.0, 9.0)
-_RELEASED = "#f1efe8"
-_DOUBT = "#a33a2a"
+_RELEASED = light("turn")
+_DOUBT = light("bad")
 _LONGEST_LINE = 150  # characters of a warning
 _NAMES = {
     "vx_mps": ("Forward velocity", "m/s"),

@@ -4,6 +4,8 @@ import importlib.resources
 import re
 from collections.abc import Mapping
 
+from countersteer.viewing.style import palette_css
+
 FOLDER = importlib.resources.files("countersteer.viewing")
 
 
@@ -12,6 +14,7 @@ def filled(template: str, fields: Mapping[str, str]) -> str:
 
     All fields are replaced in one pass. So a value that looks like a field stays text.
     """
-    known = {"style": (FOLDER / "page.css").read_text(encoding="utf-8").rstrip(), **fields}
+    shared = (FOLDER / "page.css").read_text(encoding="utf-8").rstrip()
+    known = {"style": f"{palette_css()}\n{shared}", **fields}
     text = (FOLDER / template).read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda field: known[field[1]], text)

@@ -9,13 +9,20 @@ import pathlib
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from countersteer.viewing.style import DPI, INK, LINE, PAPER, SOFT, new_figure
+from countersteer.viewing.look import (
+    BODY,
+    REAR_WINDOW,
+    SKID_DARKEST,
+    SKID_FROM_MPS,
+    SKID_FULL_MPS,
+    WINDSCREEN,
+)
+from countersteer.viewing.style import DPI, INK, LINE, PAPER, SLIP_COLOURS, SOFT, light, new_figure
 from countersteer.writing import write_whole
 
 if TYPE_CHECKING:
@@ -27,24 +34,12 @@ Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]  # left, bottom, width, height; parts of the figure
 
 _SIZE_IN = (14.0, 9.0)
-FLOOR = "#fbfaf6"
-WALL, GLASS, _TURN, SPEED = "#39434c", "#303a43", "#f3eee1", "#0069a8"
-_GOOD, _BAD = "#00694f", "#a3210f"
-# From calm to wild. The lightness always falls, so the order is clear without red and green.
-SLIP_COLOURS = ("#a9bac7", "#e39a2b", "#a3210f")
+FLOOR, WALL, GLASS = light("floor"), light("wall"), light("glass")
+_TURN, SPEED, SIDESLIP = light("turn"), light("velocity"), light("slip-mid")
+_GOOD, _BAD = light("good"), light("bad")
 
-SKID_FROM_MPS, SKID_FULL_MPS = 0.3, 2.0
-_SKID_FAINTEST, SKID_DARKEST = 0.12, 0.42
+_SKID_FAINTEST = 0.12
 _MOST_SKID_SAMPLES = 2000
-
-# Outlines in halves of the car's length and width, from the centre of the outline.
-_LEFT_OF_BODY = [
-    *((-1.0, 0.3), (-0.98, 0.7), (-0.92, 0.92), (-0.8, 1.0), (-0.5, 0.96), (-0.2, 0.93)),
-    *((0.2, 0.93), (0.62, 0.96), (0.82, 0.88), (0.94, 0.66), (1.0, 0.3)),
-]
-BODY = np.array(_LEFT_OF_BODY + [(u, -v) for u, v in reversed(_LEFT_OF_BODY)])
-WINDSCREEN = np.array([(0.3, 0.6), (0.36, 0), (0.3, -0.6), (0.06, -0.5), (0.09, 0), (0.06, 0.5)])
-REAR_WINDOW = np.array([(-0.6, 0.56), (-0.62, 0), (-0.6, -0.56), (-0.42, -0.46), (-0.42, 0.46)])
 
 _GHOST_EVERY_S, _GHOST_EVERY_IN_TURN_S, _MOST_GHOSTS = 0.25, 0.15, 160
 # Ghosts that hide each other show nothing. These are the least distances, in car lengths, from a
@@ -53,6 +48,7 @@ _STEP_LENGTHS, _CLEARANCE_LENGTHS = 0.4, 0.6
 _SAME_PASS_S, _TURNED_RAD = 1.0, math.radians(20)
 
 _MOST_TURN_NUMBERS = 16
+_TITLE, _LEAST_TITLE = 58, 10.0  # characters that fit at 18 points; points of the smallest
 _DASHES = (3.0, 2.0)
 
 
@@ -85,7 +81,7 @@ def picture_png(view: dict[str, Any]) -> bytes:
     low, high = _bounds(view)
     layout = _BELOW if high[0] - low[0] > _LONG * (high[1] - low[1]) else _BESIDE
     colours = LinearSegmentedColormap.from_list("sideslip", SLIP_COLOURS)
-    largest = float(np.max(np.abs(view["sideslip_deg"])))
+    largest = float(np.max(np.abs(_sideslip(view)), initial=0.0))
     colours_end = max(20, 5 * math.ceil(largest / 5))
 
     _write_headline(figure, view, largest)
@@ -95,6 +91,16 @@ def picture_png(view: dict[str, Any]) -> bytes:
     png = io.BytesIO()
     canvas.print_png(png, pil_kwargs={"compress_level": 1})
     return png.getvalue()
+
+
+def _sideslip(view: dict[str, Any]) -> Array:
+    """The sideslip (°), and 0 where it is unknown."""
+    return np.nan_to_num(np.array(view.get("sideslip_deg", np.zeros(len(view["time_s"])))))
+
+
+def _steering(view: dict[str, Any]) -> Array:
+    """The angle of the front wheels (°): as simulated, or else as asked for."""
+    return np.array(view.get("steering_deg", view["steering_command_deg"]))
 
 
 def _bounds(view: dict[str, Any]) -> tuple[Array, Array]:
@@ -111,22 +117,27 @@ def _write_headline(figure: "Figure", view: dict[str, Any], largest_sideslip: fl
     """Write the title, the outcome and the main figures across the top."""
     summary = view["summary"]
     status = str(summary.get("verdict", summary["outcome"]))
-    figure.text(0.022, 0.955, str(view["title"]), color=INK, size=18, weight="bold", va="center")
+    title = str(view["title"])
+    size = max(_LEAST_TITLE, min(18.0, 18.0 * _TITLE / max(len(title), 1)))
+    if len(title) * size > 18 * _TITLE:
+        title = title[: int(18 * _TITLE / size) - 1] + "…"
+    figure.text(0.022, 0.955, title, color=INK, size=size, weight="bold", va="center")
     verdict = status[:1].upper() + status[1:]
     mood = _GOOD if summary.get("success", summary["completed"]) else _BAD
-    if mood == _GOOD and summary.get("drifts", len(summary["turns"])) < len(summary["turns"]):
+    turns = len(summary["turns"])
+    if summary["outcome"] == "not judged" or (
+        mood == _GOOD and summary.get("drifts", turns) < turns
+    ):
         mood = INK
     figure.text(0.022, 0.914, verdict, color=mood, size=13, weight="bold", va="center")
     lap_time, times = summary.get("lap_time_s"), view["time_s"]
     contacts = summary["wall_contacts"]
-    facts = (
-        ("drive time", f"{times[-1] - times[0]:.2f} s")
-        if lap_time is None
-        else ("lap time", f"{lap_time:.2f} s"),
-        ("wall contacts", "–" if contacts is None else f"{contacts}"),
-        ("largest sideslip", f"{largest_sideslip:.0f}°"),
-    )
-    for right, (name, value) in zip((0.718, 0.845, 0.978), facts, strict=True):
+    facts = [("largest sideslip", f"{largest_sideslip:.0f}°")]
+    if contacts is not None:
+        facts.append(("wall contacts", f"{contacts}"))
+    driven = ("drive time", f"{times[-1] - times[0]:.2f} s")
+    facts.append(driven if lap_time is None else ("lap time", f"{lap_time:.2f} s"))
+    for right, (name, value) in zip((0.978, 0.845, 0.718), facts, strict=False):
         bold = figure.text(right, 0.955, value, color=INK, size=17, va="center", ha="right")
         bold.set_fontweight("bold")
         figure.text(right, 0.916, name, color=SOFT, size=10.5, va="center", ha="right")
@@ -206,7 +217,7 @@ def _draw_ghosts(
     poses = _poses(view)[chosen]
     half = np.array([car["length_m"] / 2, car["width_m"] / 2])
     centre = np.array([car["center_x_m"], 0.0])
-    paints = colours(np.abs(np.array(view["sideslip_deg"])[chosen]) / colours_end)
+    paints = colours(np.abs(_sideslip(view)[chosen]) / colours_end)
     body, windscreen, rear_window = (
         placed(shape * half + centre, poses) for shape in (BODY, WINDSCREEN, REAR_WINDOW)
     )
@@ -253,6 +264,8 @@ def _ghosts(view: dict[str, Any]) -> NDArray[np.intp]:
 
 def _number_turns(axes: "Axes", view: dict[str, Any]) -> None:
     """Write each turn's number on the inside of its middle, unless there are too many turns."""
+    from matplotlib.patheffects import withStroke
+
     turns = view["summary"]["turns"]
     if len(turns) > _MOST_TURN_NUMBERS:
         return
@@ -273,6 +286,7 @@ def _number_turns(axes: "Axes", view: dict[str, Any]) -> None:
         x, y = points[1] + inward / norm * 1.1 * view["car"]["length_m"]
         text = axes.text(x, y, str(number), color=SOFT, size=15, ha="center", va="center")
         text.set(weight="bold", zorder=5)
+        text.set_path_effects([withStroke(linewidth=4, foreground=FLOOR)])
 
 
 def _poses(view: dict[str, Any]) -> Array:
@@ -295,7 +309,7 @@ def _placed_wheel(
     if view["wheels"]:
         angle = np.array(view["wheels"][which]["angle_rad"])[chosen]
     elif which < 2:
-        angle = np.radians(np.array(view["steering_deg"])[chosen])
+        angle = np.radians(_steering(view)[chosen])
     else:
         angle = np.zeros(len(chosen))
     hub = placed(np.array([(wheel["x_m"], wheel["y_m"])]), poses)[:, 0]
@@ -365,22 +379,27 @@ class _Strip(NamedTuple):
 
     name: str
     unit: str
-    values: Sequence[float]
+    values: Array
     colour: str
-    command: Sequence[float] | None = None
+    command: Array | None
 
 
 def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> None:
     """Draw the quantities over time, one strip under the other."""
-    strips = (
-        _Strip("Speed", "m/s", view["speed_mps"], SPEED),
-        _Strip("Sideslip", "°", view["sideslip_deg"], "#c97a10"),
-        _Strip("Yaw rate", "°/s", view["yaw_rate_degps"], SOFT),
-        _Strip("Steering", "°", view["steering_deg"], SOFT, view["steering_command_deg"]),
-        _Strip("Throttle", "%", [100 * part for part in view["throttle"]], SOFT)
-        if "throttle" in view
-        else _Strip("Commanded speed", "m/s", view["commanded_speed_mps"], SOFT),
-    )
+    asked, throttle = view["steering_command_deg"], view.get("throttle")
+    strips = [
+        _Strip(name, unit, values, colour, command)
+        for name, unit, values, colour, command in (
+            ("Speed", "m/s", view.get("speed_mps"), SPEED, None),
+            ("Sideslip", "°", view.get("sideslip_deg"), SIDESLIP, None),
+            ("Yaw rate", "°/s", view.get("yaw_rate_degps"), SOFT, None),
+            ("Steering", "°", view.get("steering_deg"), SOFT, asked),
+            ("Steering asked for", "°", None if "steering_deg" in view else asked, SOFT, None),
+            ("Throttle", "%", None if throttle is None else 100 * np.array(throttle), SOFT, None),
+            ("Commanded speed", "m/s", view.get("commanded_speed_mps"), SOFT, None),
+        )
+        if values is not None
+    ]
     left, bottom, width, height = place
     pitch = height / len(strips)
     caption = 0.026
@@ -394,8 +413,9 @@ def _draw_strips(figure: "Figure", place: Rectangle, view: dict[str, Any]) -> No
 def _draw_strip(axes: "Axes", strip: _Strip, view: dict[str, Any], is_last: bool) -> None:
     """Draw the curves of one strip. Only the last strip has labels on its time axis."""
     time = view["time_s"]
-    shown = [0.0, *strip.values, *(strip.command or ())]
-    low, high = min(shown), max(shown)
+    lines = [strip.values] if strip.command is None else [strip.values, strip.command]
+    shown = np.nan_to_num(np.concatenate([[0.0], *lines]))
+    low, high = float(shown.min()), float(shown.max())
     # A quantity that never changes still needs a height.
     span = max(high - low, 1e-3)
     for turn in view["summary"]["turns"]:
@@ -415,7 +435,8 @@ def _draw_strip(axes: "Axes", strip: _Strip, view: dict[str, Any], is_last: bool
         length=0, labelsize=9.5, labelcolor=SOFT, pad=5, labelbottom=is_last, bottom=is_last
     )
     if is_last:
-        axes.set_xlabel("time, s", color=SOFT, size=9.5, labelpad=3, loc="right")
+        shaded = "shaded: turns      " if view["summary"]["turns"] else ""
+        axes.set_xlabel(f"{shaded}time, s", color=SOFT, size=9.5, labelpad=3, loc="right")
 
 
 def _write_caption(
@@ -466,7 +487,7 @@ class Painter:
 
     def draw(self, view: dict[str, Any]) -> None:
         """Begins `picture_png`, over there."""
-        self._view = json.dumps(view).encode()
+        self._view = json.dumps(view, default=np.ndarray.tolist).encode()
         self._thread = threading.Thread(target=self._send)
         self._thread.start()
 

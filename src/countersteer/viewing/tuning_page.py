@@ -24,6 +24,7 @@ from countersteer.viewing.style import (
     draw_commands,
     draw_windows,
     dress,
+    light,
     new_figure,
 )
 from countersteer.writing import write_whole
@@ -52,7 +53,7 @@ MEASURES = {
 MANY = 6  # lines; a longer list is folded
 CORRELATED = 0.8
 
-_HELD_OUT = "#7a5ba8"
+_HELD_OUT = light("held-out")
 _WIDTH_IN, _STRIP_IN, _FOOT_IN, _DPI = 11.0, 1.35, 0.45, 120
 _LONGEST = 40.0  # s, longest drawn part of a log
 _MOST_WINDOWS = 40  # in a strip
@@ -599,8 +600,9 @@ def _spread(values: Numbers) -> float:
 def _digits(value: float, deviation: float) -> tuple[int, int]:
     """The power of ten to factor out of a small number, and decimals that show the deviation."""
     least = next((x for x in (deviation, abs(value) / 100) if math.isfinite(x) and x > 0), 1.0)
-    small = 0 < abs(value) < 1e-3
-    power = math.floor(math.log10(abs(value))) if small else 0
+    # A deviation that is far larger than the value sets the power: 0.000 ± 0.027.
+    largest = max(abs(value), deviation if math.isfinite(deviation) else 0.0)
+    power = math.floor(math.log10(largest)) if 0 < largest < 1e-3 else 0
     return power, min(max(1 - math.floor(math.log10(least)) + power, 0), 6)
 
 
