@@ -45,6 +45,7 @@ MAY_IMPORT = {
         "car", "course", "pilot", "task", "runs", "batch", "envs", "link",
         "drivers",  # what is learned is a driver's numbers
         "experiments",  # from which it learns
+        "planning",  # where the walls are
     },
     "experiments": {
         "car", "course", "world", "link", "estimation", "pilot", "simulator", "task", "runs",

@@ -48,6 +48,31 @@ def add(verbs: Verbs) -> None:
     ppo.seed()
     ppo.out_file("POLICY.npz", "policy")
 
+    does = "a table of values over a grid of states, by dynamic programming with the car's model"
+    table = learn("tabular", does, run_tabular)
+    table.add_argument("course", metavar="COURSE", help="as for drive")
+    table.option("--car", None, str, "rx7", "the nominal one")
+    meaning = (
+        "the grid: NAME=STEP or NAME=LOW:HIGH:STEP. A pose is place_m, offset_m, heading_deg or "
+        "x_m, y_m, heading_deg. A motion is speed_mps or vx_mps, and any of vy_mps, sideslip_deg, "
+        "yaw_rate_degps, steering_deg (default: what laps box, see docs/tabular.md)"
+    )
+    table.option("--dimensions", "NAME=STEP", str, None, meaning, nargs="+")
+    throttle, lock = number(-1, 1), number(-90, 90)
+    table.option("--throttle", "T", throttle, [0.0, 0.5, 1.0], "of the actions", nargs="+")
+    angles = [-28.0, -14.0, 0.0, 14.0, 28.0]
+    table.option("--steering-deg", "DEG", lock, angles, "of the actions", nargs="+")
+    table.option("--decision-s", "S", number(0.02, 1), 0.12, "for which an action is held")
+    meaning = "rewards so far ahead count 1/e"
+    table.option("--horizon-s", "S", number(0.2, 1000), 2.0, meaning)
+    table.option("--margin-m", "M", number(0, 1), 0.03, "from a wall that counts as a touch")
+    meaning = "how a term of the reward counts: time, road, goal or progress (repeatable)"
+    table.option("--reward", "TERM=WEIGHT", str, [], meaning, action="append")
+    table.option("--cars", "SET", str, "around", "random cars that judge it, as for evaluate")
+    table.option("--trials", "N", number(0, 10**6, int), 256, "random cars that judge it; 0: none")
+    table.seed()
+    table.out_file("POLICY.npz", "policy")
+
     does = "the best open-loop commands for a car that is wholly known: a yardstick for drivers"
     best = learn("optimum", does, run_optimum)
     best.add_argument("course", metavar="COURSE", help="as for drive")
@@ -173,6 +198,7 @@ def learn_ppo(options: argparse.Namespace) -> int:
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.errors import InputError
+    from countersteer.task.reward import DRIFTING, weights_of
 
     configure_jax(blocks=True, cores=cores)
     try:
@@ -189,7 +215,7 @@ def learn_ppo(options: argparse.Namespace) -> int:
         car,
         options.cars,
         load_population(options.cars),
-        ppo.weights_of(options.reward),
+        weights_of(options.reward, DRIFTING),
         options.seed,
         round(options.samples * 1e6),
     )
@@ -212,6 +238,99 @@ def learn_ppo(options: argparse.Namespace) -> int:
         return DONE
     print("\n".join(["in new trials, on ground truth:", *table_lines({course.name: found})]))
     print(f"policy: {files['policy']}; curves: {options.out.with_suffix('.png')}, .csv")
+    print(
+        f"to see it: countersteer drive {options.course} --car {options.car} "
+        f"--driver {options.out} --estimate truth"
+    )
+    return DONE
+
+
+def run_tabular(options: argparse.Namespace) -> int:
+    """`learn tabular`."""
+    with out_file(options.out, ".npz"):
+        return learn_tabular(options)
+
+
+def learn_tabular(options: argparse.Namespace) -> int:
+    """The table, its solution, the drive of the nominal car, and the verdict of random ones."""
+    from countersteer.batch.engine import flags
+
+    cores = os.cpu_count() or 1
+    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    from countersteer.batch.evaluate import nominal_drive, table_lines, verdict
+    from countersteer.batch.population import load_population
+    from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
+    from countersteer.course.files import load_course
+    from countersteer.drivers.registry import learned
+    from countersteer.learning import tabular
+    from countersteer.runs.files import csv_text
+    from countersteer.task.judge import Outcome, summary
+    from countersteer.task.reward import weights_of
+    from countersteer.viewing.slices import draw_slices
+    from countersteer.writing import whole, write_whole
+
+    configure_jax(blocks=True, cores=cores)
+    course, car = load_course(options.course), load_car(options.car)
+    population = load_population(options.cars)
+    job = tabular.Job(
+        course,
+        Path(options.car).stem,
+        car,
+        tabular.dimensions_of(options.dimensions or tabular.DIMENSIONS, course),
+        tuple(options.throttle),
+        tuple(map(math.radians, options.steering_deg)),
+        options.decision_s,
+        options.horizon_s,
+        weights_of(options.reward, tabular.WEIGHTS, tabular.TERMS),
+        options.margin_m,
+    )
+    count = len(job.actions.throttle)
+    say(
+        options,
+        f"{job.table.size:,} states, {count} actions; the table compiles for half a minute first",
+    )
+    with Progress(options.json) as progress:
+
+        def report(what: str, value: float) -> None:
+            if what == "table":
+                progress.show(value, 1.0)
+            else:
+                say(options, f"  a sweep changed values by {value:.3g}; "
+                    f"done under {tabular.SETTLED:g}")  # fmt: skip
+
+        found = tabular.learn(job, cores, report)
+    cost = found.cost
+    say(options, f"table {cost['table_cpu_s']:.0f} s of CPU, solution "
+        f"{cost['cpu_s'] - cost['table_cpu_s']:.0f} s")  # fmt: skip
+    write_whole(options.out, tabular.policy_file(job, found.solution, cost))
+    curve = found.solution.curve
+    rows = [list(row.values()) for row in curve]
+    write_whole(options.out.with_suffix(".csv"), csv_text(list(curve[0]), rows))
+    say(options, "judging it, which compiles for a minute the first time")
+    driver = learned("tabular", options.out, course, car)
+    score, path = nominal_drive(course, car, driver)
+    drive = summary(score, Outcome.of(int(score.outcome)))
+    # Seeds that nothing is learned with.
+    judged = {}
+    if options.trials:
+        first = UNSEEN + options.seed
+        judged = verdict(course, car, population, driver, first, options.trials)
+    picture = options.out.with_suffix(".png")
+    with whole(picture) as part:
+        title = f"learn tabular: {course.name}, {job.car_name}; {drive['verdict']}"
+        draw_slices(tabular.slices(job, found.solution), course.walls, path, title, part)
+    result = {"policy": str(options.out), "picture": str(picture), "states": job.table.size,
+              "actions": count, "cost": cost, "sweeps": curve, "nominal": drive,
+              "verdict": judged}  # fmt: skip
+    if options.json:
+        print(json.dumps(result))
+        return DONE
+    lap = "" if drive["lap_time_s"] is None else f", {drive['lap_time_s']:.2f} s"
+    print(f"the nominal car, from rest: {drive['verdict']}{lap}")
+    if judged:
+        print("\n".join(["random cars, on ground truth:", *table_lines({course.name: judged})]))
+    print(f"policy: {options.out}; picture: {picture}; sweeps: {options.out.with_suffix('.csv')}")
     print(
         f"to see it: countersteer drive {options.course} --car {options.car} "
         f"--driver {options.out} --estimate truth"

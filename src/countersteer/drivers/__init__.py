@@ -5,4 +5,5 @@ DRIVERS = (
     "straighten",
     "pursuit",
     "ppo",
+    "tabular",
 )  # of the library; `plan.library` names its plans

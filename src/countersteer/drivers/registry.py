@@ -8,7 +8,7 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers import DRIVERS, own, plan, policy, ppo
+from countersteer.drivers import DRIVERS, own, plan, policy, ppo, stored, tabular
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
@@ -20,6 +20,7 @@ from countersteer.reading.values import short, shown
 from countersteer.text import nearest, read_toml
 
 KINDS = (policy.KIND, "plan")  # of a file
+LEARNED = (ppo.KIND, tabular.KIND)  # of an .npz
 
 
 def make_driver(
@@ -48,9 +49,10 @@ def make_driver(
         return own.own_driver(name, course, car, speed, laps), {"kind": "python", "name": name}
     if name in ("straighten", "pursuit"):
         tables = {"kind": name, **tables}
-    elif name == ppo.KIND or name.endswith(".npz"):
-        file = ppo.policy_for(course, car) if name == ppo.KIND else Path(name)
-        tables = {"kind": ppo.KIND, "file": str(file), **tables}
+    elif name in LEARNED:
+        tables = {"kind": name, "file": str(stored.policy_for(name, course, car)), **tables}
+    elif name.endswith(".npz"):
+        tables = {"kind": stored.kind_of(Path(name)), "file": name, **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
         kind = numbers.get("kind")
@@ -78,17 +80,26 @@ def driver_of_tables(
         return straighten(course, car, speed)
     if kind == "pursuit":
         return pursuit(course, car, speed)
-    if kind == ppo.KIND:
+    if kind in LEARNED:
         if speed is not None:
             raise InputError(
                 f"--speed-mps: {short(where)} has its own speed, and is asked for none"
             )
-        layers, about = ppo.read_network(Path(where))
-        ppo.check_for(short(where), about, course, car)
-        return ppo.network_driver(course, car, layers)
+        return learned(str(kind), Path(where), course, car)
     if kind == policy.KIND and numbers:
         return drift_turn(course, car, speed, laps, *policy.policy_of_tables(numbers, where))
     raise InputError(f"{short(where)}: no driver of kind {shown(kind)} can be made from plain data")
+
+
+def learned(kind: str, file: Path, course: Course, car: Car) -> Driver:
+    """The driver of a learned policy's file. Raises `InputError`."""
+    if kind == ppo.KIND:
+        layers, about = ppo.read_network(file)
+        stored.check_for(short(str(file)), about, course, car)
+        return ppo.network_driver(course, car, layers)
+    arrays, about, table = tabular.read_table(file)
+    stored.check_for(short(str(file)), about, course, car)
+    return tabular.table_driver(course, car, arrays, about, table)
 
 
 def replay(commands: Mapping[str, np.ndarray]) -> Replay:
