@@ -1,5 +1,6 @@
 """Drivers by their names on the command line, and by their tables in `run.toml`."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,31 @@ def learned(kind: str, file: Path, course: Course, car: Car) -> Driver:
     arrays, about, table = tabular.read_table(file)
     stored.check_for(short(str(file)), about, course, car)
     return tabular.table_driver(course, car, arrays, about, table)
+
+
+def steers_by(tables: Mapping[str, Any]) -> str:
+    """What a driver steers by, in a few words, by its table."""
+    kind = tables.get("kind")
+    if kind in ("straighten", policy.KIND):
+        return "sonar, and the estimate's velocities"
+    if kind in (*LEARNED, "pursuit"):
+        return "the estimate's pose"
+    return {"replay": "the clock", "plan": "its plan"}.get(str(kind), "what it likes")
+
+
+def learned_at(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """What a driver cost to learn, by its file: `samples` and `cpu_s`, as far as it says so."""
+    kind = tables.get("kind")
+    if kind not in LEARNED:
+        return {}
+    about = stored.read(Path(str(tables["file"])), str(kind))[1]
+    parts = [about.get("learned_with"), about.get("cost")]
+    told = {key: value for part in parts if isinstance(part, dict) for key, value in part.items()}
+    return {
+        key: float(told[key])
+        for key in ("samples", "cpu_s")
+        if isinstance(told.get(key), int | float) and math.isfinite(told[key])
+    }
 
 
 def replay(commands: Mapping[str, np.ndarray]) -> Replay:
