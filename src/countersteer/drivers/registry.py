@@ -110,7 +110,7 @@ def steers_by(tables: Mapping[str, Any]) -> str:
         return "sonar, and the estimate's velocities"
     if kind in (*LEARNED, "pursuit"):
         return "the estimate's pose"
-    return {"replay": "the clock", "plan": "its plan"}.get(str(kind), "what it likes")
+    return {"replay": "the clock", "plan": "its plan"}.get(str(kind), "what its code asks for")
 
 
 def learned_at(tables: Mapping[str, Any]) -> dict[str, Any]:

@@ -346,23 +346,36 @@ class Solver:
         self._improve = jax.jit(engine.on_cores(self._best, mesh, (shared, own)))
         self._hold = jax.jit(engine.on_cores(self._held, mesh, (shared, own, own)))
 
-    def solve(self, report: Callable[[dict[str, float]], None] = lambda _: None) -> Solution:
-        """Iterate until the values have settled. `report` is told each row of the curve."""
+    def solve(
+        self,
+        report: Callable[[dict[str, float]], None] = lambda _: None,
+        look: Callable[[Array], float] | None = None,
+    ) -> Solution:
+        """Iterate until the values have settled. `report` is told each row of the curve.
+
+        `look` makes a figure `metres` of the values (motions, poses) of each row.
+        """
         values = jnp.zeros((self.size, self.job.table.pose.size), jnp.float32)
         curve: list[dict[str, float]] = []
-        begun = time.process_time()
+        spent = 0.0
         for number in range(1, MOST_ROUNDS + 1):
+            begun = time.process_time()
             new, best = self._improve(values, self.table)
             change = float(jnp.max(jnp.abs(new - values)))
-            curve.append(
-                {"sweep": float(number), "change": change, "cpu_s": time.process_time() - begun}
-            )
-            report(curve[-1])
             values = new
+            spent += time.process_time() - begun
+            row = {"sweep": float(number), "change": change, "cpu_s": spent}
+            if look is not None:
+                row["metres"] = look(values[: self.count])
+            curve.append(row)
+            report(row)
             if change < SETTLED:
                 break
+            begun = time.process_time()
             for _ in range(SWEEPS):
                 values = self._hold(values, best, self.table)
+            values.block_until_ready()
+            spent += time.process_time() - begun
         values, best = (np.asarray(part)[: self.count] for part in (values, best))
         return Solution(values, best, curve)
 
@@ -419,8 +432,13 @@ class Solver:
         return jnp.where(self.touches, self.job.weights.road, values)
 
 
-def policy_file(job: Job, solution: Solution, cost: Mapping[str, float]) -> bytes:
-    """The content of a policy's file. Values are kept in steps of `KEPT`."""
+def policy_file(
+    job: Job, values: np.ndarray, learned: Mapping[str, Any], cost: Mapping[str, float]
+) -> bytes:
+    """The content of a policy's file. Values are kept in steps of `KEPT`.
+
+    `learned` says how, and `cost` has `samples` and `cpu_s`.
+    """
     about = {
         "kind": tabular.KIND,
         "format": tabular.FORMAT,
@@ -431,16 +449,11 @@ def policy_file(job: Job, solution: Solution, cost: Mapping[str, float]) -> byte
         "decision_s": job.decision,
         "discount": job.discount,
         "reward": {name: getattr(job.weights, name) for name in TERMS},
-        "learned_with": {
-            "method": "modified policy iteration",
-            "horizon_s": job.horizon,
-            "margin_m": job.margin,
-            "sweeps": len(solution.curve),
-        },
+        "learned_with": {"horizon_s": job.horizon, "margin_m": job.margin, **learned},
         "cost": dict(cost),
         "fingerprint": stored.fingerprint(job.course, job.car),
     }
-    values = KEPT * np.round(solution.values / KEPT)
+    values = KEPT * np.round(values / KEPT)
     arrays = {"values": values.astype(np.float16), **job.actions._asdict()}
     return stored.packed(arrays, about)
 
@@ -456,18 +469,24 @@ def learn(
     job: Job,
     cores: int,
     report: Callable[[str, float], None] = lambda *_: None,
+    look: Callable[[Array], float] | None = None,
 ) -> Learned:
-    """The table, and its solution. `report` is told what is done: a part, or the last change."""
+    """The table, and its solution. `report` is told what is done: a part, or the last change.
+
+    `look` is `Solver.solve`'s.
+    """
     begun = time.process_time()
     table, poses = transitions(job, frame_of(job.course), cores, lambda part: report("table", part))
     made = time.process_time()
-    solution = Solver(job, table, poses, cores).solve(lambda row: report("change", row["change"]))
+    solver = Solver(job, table, poses, cores)
+    placed = time.process_time()
+    solution = solver.solve(lambda row: report("change", row["change"]), look)
     count = len(job.actions.throttle)
     cost = {
         "samples": float(job.table.motion.size * count),
         "transitions": float(job.table.size * count),
         "table_cpu_s": made - begun,
-        "cpu_s": time.process_time() - begun,
+        "cpu_s": placed - begun + solution.curve[-1]["cpu_s"],
     }
     return Learned(solution, cost)
 
