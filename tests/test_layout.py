@@ -49,6 +49,7 @@ MAY_IMPORT = {
         "drivers",  # what is learned is a driver's numbers
         "experiments",  # from which it learns
         "viewing",  # pictures have one style
+        "planning",  # where the walls are
     },
     "experiments": {
         "car", "course", "world", "link", "estimation", "pilot", "simulator", "task", "runs",

@@ -19,11 +19,12 @@ from countersteer.car.parameter import pytree
 from countersteer.course.files import load_course
 from countersteer.drivers import ppo as network
 from countersteer.drivers.ppo import FEATURES, Layer, read_network
+from countersteer.drivers.stored import fingerprint
 from countersteer.errors import InputError
 from countersteer.learning import checkpoint, ppo
 from countersteer.learning.ppo import Job, Met, Settings, Trainer, advantages
 from countersteer.task.judge import Outcome
-from countersteer.task.reward import DRIFTING, Reward
+from countersteer.task.reward import DRIFTING, Reward, weights_of
 
 
 class Turned(NamedTuple):
@@ -220,9 +221,9 @@ def test_a_policy_drives_in_the_simulator_and_is_refused_elsewhere(tmp_path, cap
         for a, b in itertools.pairwise(sizes)
     )
     about = {"course": "box", "car": "rx7", "task": "lap",
-             "fingerprint": network.fingerprint(load_course("box"), load_car("rx7"))}  # fmt: skip
+             "fingerprint": fingerprint(load_course("box"), load_car("rx7"))}  # fmt: skip
     path = tmp_path / "mine.npz"
-    np.savez(path, **network.network_arrays(layers, about))
+    path.write_bytes(network.network_file(layers, about))
     words = ["--driver", str(path), "--estimate", "truth", "--json"]
     assert cli.main(["drive", "box", *words, "--out", str(tmp_path / "run")]) in (0, 1)
     assert json.loads(capsys.readouterr().out)["outcome"] != "lost its state"
@@ -249,9 +250,11 @@ def test_a_damaged_policy_is_refused_in_one_line(tmp_path, change, says):
         Layer(np.zeros((FEATURES, 4), np.float32), np.zeros(4, np.float32)),
         Layer(np.zeros((4, 2), np.float32), np.zeros(2, np.float32)),
     )
-    held = network.network_arrays(layers, {"course": "box"})
-    change(held)
     path = tmp_path / "p.npz"
+    path.write_bytes(network.network_file(layers, {"course": "box"}))
+    with np.load(path) as file:
+        held = dict(file)
+    change(held)
     np.savez(path, allow_pickle=True, **held)
     with pytest.raises(InputError, match=says) as caught:
         read_network(path)
@@ -266,8 +269,8 @@ def test_a_checkpoint_that_is_none_is_refused(tmp_path):
 
 
 def test_the_weights_of_the_reward_are_read():
-    assert ppo.weights_of(["sideslip=5"]).sideslip == 5.0
+    assert weights_of(["sideslip=5"], DRIFTING).sideslip == 5.0
     with pytest.raises(InputError, match="there is no term 'slip'"):
-        ppo.weights_of(["slip=5"])
+        weights_of(["slip=5"], DRIFTING)
     with pytest.raises(InputError, match="is not a number"):
-        ppo.weights_of(["sideslip=much"])
+        weights_of(["sideslip=much"], DRIFTING)

@@ -5,17 +5,19 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.stats import binomtest
 
 from countersteer.batch.population import Drawn, Population, draw
 from countersteer.batch.separation import separation_line
+from countersteer.batch.trace import Trace, path_of
 from countersteer.batch.trials import Watch, run_trials
 from countersteer.car.car import Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
-from countersteer.link.link import Link
+from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
 from countersteer.sensing.faults import SensorFault
 from countersteer.task.judge import DRIFT, Outcome, Score
@@ -112,8 +114,13 @@ def interval(successes: int, trials: int) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
-    """Statistics of a driver's trials; names and units are those of the JSON."""
+def results(
+    score: Score, seeds: Sequence[int], margins: np.ndarray | None = None
+) -> dict[str, Any]:
+    """Statistics of a driver's trials; names and units are those of the JSON.
+
+    `margins` (m) are the least distances to a wall (`batch.margin`).
+    """
     won, turns = score.outcome == Outcome.REACHED.code, score.turns
     count, trials = int(np.sum(won)), len(seeds)
     begun = np.isfinite(turns.begin)  # a corner may be passed without a turn of its own
@@ -136,12 +143,31 @@ def results(score: Score, seeds: Sequence[int]) -> dict[str, Any]:
         **overshoot(np.degrees(turns.overshoot[counted])),
         "entry_speed_mps_median": median(turns.entry_speed[counted]),
         "lap_time_s_median": median(score.goal_time[won]),
+        "wall_margin_m_median": None if margins is None else median(margins[won]),
         "failed_seeds": [int(seed) for seed in numbers[~won]],
         "failures": {
             Outcome.of(code).value: [int(seed) for seed in numbers[score.outcome == code]]
             for code in np.unique(score.outcome[~won])
         },
     }
+
+
+def verdict(
+    course: Course, car: Car, population: Population, driver: Driver, first: int, count: int = 256
+) -> dict[str, Any]:
+    """The results of a driver on ground truth, in trials from the seed `first` on."""
+    seeds = [(first + i) % 2**31 for i in range(count)]
+    trials = Trials(course, car, car, population, seeds, None, 1, ONBOARD, "truth", 0.001)
+    return results(trials.run(lambda _: driver), seeds)
+
+
+def nominal_drive(course: Course, car: Car, driver: Driver) -> tuple[Score, np.ndarray]:
+    """The score and the path (`batch.trace`) of the car itself, from rest, on ground truth."""
+    alone = Population("nominal", (), (1.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0))
+    trials = Trials(course, car, car, alone, [0], None, 1, ONBOARD, "truth", 0.001)
+    score, paths = trials.run_watched(lambda _: driver, Trace())
+    first: Score = jax.tree.map(lambda leaf: leaf[0], score)
+    return first, path_of(paths[0])
 
 
 def overshoot(degrees: np.ndarray) -> dict[str, float | None]:

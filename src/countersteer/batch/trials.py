@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 
 from countersteer.batch import engine
 from countersteer.batch.population import Drawn
-from countersteer.car.car import Car
+from countersteer.car.car import Body, Car
 from countersteer.course.course import Course
 from countersteer.drivers.driver import Driver
 from countersteer.errors import InputError
@@ -26,7 +26,7 @@ from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot, PilotMemory, traceable
 from countersteer.sensing import all_sensors
 from countersteer.sensing.faults import SensorFault
-from countersteer.signals import Array, Scalar
+from countersteer.signals import Array, Motion, Scalar
 from countersteer.simulator import PIECE, Loop, Simulator, begin, tick
 from countersteer.task.judge import PERIOD, Outcome, Sample, Score, Task, samples
 from countersteer.world import planar
@@ -79,6 +79,15 @@ class Watch(Protocol):
 
     def end(self, kept: Any) -> Any:
         """The result, as arrays."""
+        ...
+
+
+@runtime_checkable
+class MotionWatch(Protocol):
+    """A watch that looks at motion alone, so it can also watch drivers in Python."""
+
+    def least(self, body: Body, motion: Motion) -> Any:
+        """The result for a motion with leaves (n,)."""
         ...
 
 
@@ -209,19 +218,19 @@ def run_trials(
     """Run one trial for each seed: its score, and the result of `watch` (`()` without one).
 
     Each seed has its row in `drawn`, and its driver in `drivers`, which replaces the pilot's own.
-    Drivers that JAX cannot trace drive one after another; they cannot be watched or have `faults`.
+    Drivers that JAX cannot trace drive one after another. They have no `faults`, and their watch
+    is a `MotionWatch`.
     The precision is that of the leaves of `drawn`. Leaves of `faults` and of the result have a
     leading axis of trials. Raises `InputError` if the course has no goal.
     """
     if course.goal_distance is None:
         raise InputError("trials need a course with a goal")
     if not traceable(drivers[0]):
-        if watch is not None or faults:
-            raise InputError("a driver in Python cannot be watched, and has no failing sensors")
-        alone = _one_by_one(
-            course, pilot, drawn, drivers, seeds, laps, longest, report, link
+        if faults or (watch is not None and not isinstance(watch, MotionWatch)):
+            raise InputError("of a driver in Python, only its motion can be watched")
+        return _one_by_one(
+            course, pilot, drawn, drivers, seeds, laps, longest, report, link, watch
         )  # fmt: skip
-        return alone, ()
     dtype = np.asarray(drawn.charge).dtype
     first: Any = jax.tree.map(lambda leaf: leaf[0], drawn)
     simulator = Simulator.of(course, first.cars, link=link, dt=pilot.dt, floor=first.floor)
@@ -276,9 +285,10 @@ def run_trials(
 def _one_by_one(
     course: Course, pilot: Pilot, drawn: Drawn, drivers: Sequence[Driver], seeds: Sequence[int],
     laps: int, longest: float, report: Callable[[int, int], None], link: Link,
-) -> Score:  # fmt: skip
-    """The scores for drivers that JAX cannot trace: one drive after another."""
-    scores, dtype = [], np.asarray(drawn.charge).dtype
+    watch: Any = None,
+) -> tuple[Score, Any]:  # fmt: skip
+    """The scores for drivers that JAX cannot trace, one drive after another, and their watch's."""
+    scores, seen, dtype = [], [], np.asarray(drawn.charge).dtype
     task = Task.of(course, laps, walls_end=True)
     for i, (driver, seed) in enumerate(zip(drivers, seeds, strict=True)):
         alone, floor = jax.tree.map(
@@ -289,21 +299,25 @@ def _one_by_one(
             start=tuple(drawn.pose[i]), floor=floor,
         )  # fmt: skip
         score = task.init()
-        every = max(1, round(PERIOD / pilot.dt))
+        every, motions = max(1, round(PERIOD / pilot.dt)), []
         with contextlib.closing(
             simulator.run(dataclasses.replace(pilot, driver=driver), longest)
         ) as pieces:
             for record in pieces:
                 rows = np.nonzero(record.tick % every == 0)[0]
                 score, _ = task.follow(score, samples(record, rows, pilot.dt))
+                motions.append(jax.tree.map(lambda leaf, r=rows: leaf[r], record.motion))
                 if score.outcome != Outcome.DRIVING.code:
                     break
         if score.outcome == Outcome.DRIVING.code:
             score = score._replace(outcome=np.int32(Outcome.LATE.code))
         scores.append(score)
+        if watch is not None:
+            motion = jax.tree.map(lambda *leaves: np.concatenate(leaves), *motions)
+            seen.append(watch.least(alone.body, motion))
         report(i + 1, len(seeds))
     whole: Score = jax.tree.map(lambda *leaves: np.stack(leaves), *scores)
-    return whole
+    return whole, np.array(seen) if watch is not None else ()
 
 
 def _without(tree: Any, *names: str) -> Any:

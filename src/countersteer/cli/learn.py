@@ -5,9 +5,11 @@ import json
 import math
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from countersteer.cli.options import DONE, Progress, Verbs, number, out_file
+from countersteer.cli.options import DONE, Parser, Progress, Verbs, number, out_file
 
 UNSEEN = 10_000_000  # first seed of the trials that judge what was learned
 
@@ -49,6 +51,19 @@ def add(verbs: Verbs) -> None:
     ppo.seed()
     ppo.out_file("POLICY.npz", "policy")
 
+    does = "a table of values over a grid of states, by dynamic programming with the car's model"
+    table = learn("tabular", does, run_tabular)
+    grid_options(table, "what laps box")
+    table.option("--cars", "SET", str, "around", "random cars that judge it, as for evaluate")
+    table.option("--trials", "N", number(0, 10**6, int), 256, "of them; 0: none")
+
+    does = "the same values as the car drives, with and without random actions, as in the paper"
+    online = learn("online", does, run_online)
+    grid_options(online, "few cells")
+    meaning = "for which each learner drives"
+    online.option("--seconds", "S", number(100, 10**7), 20_000.0, meaning)
+    online.option("--learners", "N", number(1, 100, int), 5, "of each kind, by their seeds")
+
     does = "the best open-loop commands for a car that is wholly known: a yardstick for drivers"
     best = learn("optimum", does, run_optimum)
     best.add_argument("course", metavar="COURSE", help="as for drive")
@@ -57,6 +72,29 @@ def add(verbs: Verbs) -> None:
     best.option("--rounds", "N", number(1, 100_000, int), 600, "of the search; 0.4 s each or more")
     best.seed()
     best.out_file("COMMANDS.csv", "list of commands")
+
+
+def grid_options(made: Parser, default: str) -> None:
+    """The options of a learner on a grid, with `--seed` and `--out`."""
+    made.add_argument("course", metavar="COURSE", help="as for drive")
+    made.option("--car", None, str, "rx7", "the nominal one")
+    meaning = (
+        "the grid: NAME=STEP or NAME=LOW:HIGH:STEP. A pose is place_m, offset_m, heading_deg or "
+        "x_m, y_m, heading_deg. A motion is speed_mps or vx_mps, and any of vy_mps, sideslip_deg, "
+        f"yaw_rate_degps, steering_deg (default: {default}, see docs/tabular.md)"
+    )
+    made.option("--dimensions", "NAME=STEP", str, None, meaning, nargs="+")
+    throttle, lock = number(-1, 1), number(-90, 90)
+    made.option("--throttle", "T", throttle, [0.0, 0.5, 1.0], "of the actions", nargs="+")
+    angles = [-28.0, -14.0, 0.0, 14.0, 28.0]
+    made.option("--steering-deg", "DEG", lock, angles, "of the actions", nargs="+")
+    made.option("--decision-s", "S", number(0.02, 1), 0.12, "for which an action is held")
+    made.option("--horizon-s", "S", number(0.2, 1000), 2.0, "rewards so far ahead count 1/e")
+    made.option("--margin-m", "M", number(0, 1), 0.03, "from a wall that counts as a touch")
+    meaning = "how a term of the reward counts: time, road, goal or progress (repeatable)"
+    made.option("--reward", "TERM=WEIGHT", str, [], meaning, action="append")
+    made.seed()
+    made.out_file("POLICY.npz", "policy")
 
 
 def say(options: argparse.Namespace, line: str) -> None:
@@ -184,6 +222,7 @@ def learn_ppo(options: argparse.Namespace) -> int:
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.errors import InputError
+    from countersteer.task.reward import DRIFTING, weights_of
 
     configure_jax(blocks=True, cores=cores)
     try:
@@ -200,7 +239,7 @@ def learn_ppo(options: argparse.Namespace) -> int:
         car,
         options.cars,
         load_population(options.cars),
-        ppo.weights_of(options.reward),
+        weights_of(options.reward, DRIFTING),
         options.seed,
         round(options.samples * 1e6),
     )
@@ -230,6 +269,183 @@ def learn_ppo(options: argparse.Namespace) -> int:
     return DONE
 
 
+def run_tabular(options: argparse.Namespace) -> int:
+    """`learn tabular`."""
+    with out_file(options.out, ".npz"):
+        return learn_tabular(options)
+
+
+def tabular_job(
+    options: argparse.Namespace, course: Any, car: Any, dimensions: Sequence[str], weights: Any
+) -> Any:
+    """The `learning.tabular.Job` of the options. Raises `InputError`."""
+    from countersteer.learning import tabular
+    from countersteer.task.reward import weights_of
+
+    return tabular.Job(
+        course,
+        Path(options.car).stem,
+        car,
+        tabular.dimensions_of(options.dimensions or dimensions, course),
+        tuple(options.throttle),
+        tuple(map(math.radians, options.steering_deg)),
+        options.decision_s,
+        options.horizon_s,
+        weights_of(options.reward, weights, tabular.TERMS),
+        options.margin_m,
+    )
+
+
+def learn_tabular(options: argparse.Namespace) -> int:
+    """The table, its solution, the drive of the nominal car, and the verdict of random ones."""
+    from countersteer.batch.engine import flags
+
+    cores = os.cpu_count() or 1
+    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    from countersteer.batch.evaluate import nominal_drive, table_lines, verdict
+    from countersteer.batch.population import load_population
+    from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
+    from countersteer.course.files import load_course
+    from countersteer.drivers.registry import learned
+    from countersteer.learning import tabular
+    from countersteer.runs.files import csv_text
+    from countersteer.task.judge import Outcome, summary
+    from countersteer.viewing.slices import draw_slices
+    from countersteer.writing import whole, write_whole
+
+    configure_jax(blocks=True, cores=cores)
+    course, car = load_course(options.course), load_car(options.car)
+    population = load_population(options.cars)
+    job = tabular_job(options, course, car, tabular.DIMENSIONS, tabular.WEIGHTS)
+    count = len(job.actions.throttle)
+    say(
+        options,
+        f"{job.table.size:,} states, {count} actions; the table compiles for half a minute first",
+    )
+    with Progress(options.json) as progress:
+
+        def report(what: str, value: float) -> None:
+            if what == "table":
+                progress.show(value, 1.0)
+            else:
+                say(options, f"  a sweep changed values by {value:.3g}; "
+                    f"done under {tabular.SETTLED:g}")  # fmt: skip
+
+        found = tabular.learn(job, cores, report)
+    cost = found.cost
+    say(options, f"table {cost['table_cpu_s']:.0f} s of CPU, solution "
+        f"{cost['cpu_s'] - cost['table_cpu_s']:.0f} s")  # fmt: skip
+    curve = found.solution.curve
+    how = {"method": "modified policy iteration", "sweeps": len(curve)}
+    write_whole(options.out, tabular.policy_file(job, found.solution.values, how, cost))
+    rows = [list(row.values()) for row in curve]
+    write_whole(options.out.with_suffix(".csv"), csv_text(list(curve[0]), rows))
+    say(options, "judging it, which compiles for a minute the first time")
+    driver = learned("tabular", options.out, course, car)
+    score, path = nominal_drive(course, car, driver)
+    drive = summary(score, Outcome.of(int(score.outcome)))
+    # Seeds that nothing is learned with.
+    judged = {}
+    if options.trials:
+        first = UNSEEN + options.seed
+        judged = verdict(course, car, population, driver, first, options.trials)
+    picture = options.out.with_suffix(".png")
+    with whole(picture) as part:
+        title = f"learn tabular: {course.name}, {job.car_name}; {drive['verdict']}"
+        draw_slices(tabular.slices(job, found.solution), course.walls, path, title, part)
+    result = {"policy": str(options.out), "picture": str(picture), "states": job.table.size,
+              "actions": count, "cost": cost, "sweeps": curve, "nominal": drive,
+              "verdict": judged}  # fmt: skip
+    if options.json:
+        print(json.dumps(result))
+        return DONE
+    lap = "" if drive["lap_time_s"] is None else f", {drive['lap_time_s']:.2f} s"
+    print(f"the nominal car, from rest: {drive['verdict']}{lap}")
+    if judged:
+        print("\n".join(["random cars, on ground truth:", *table_lines({course.name: judged})]))
+    print(f"policy: {options.out}; picture: {picture}; sweeps: {options.out.with_suffix('.csv')}")
+    print(
+        f"to see it: countersteer drive {options.course} --car {options.car} "
+        f"--driver {options.out} --estimate truth"
+    )
+    return DONE
+
+
+def run_online(options: argparse.Namespace) -> int:
+    """`learn online`."""
+    with out_file(options.out, ".npz"):
+        return learn_online(options)
+
+
+def learn_online(options: argparse.Namespace) -> int:
+    """The learners that drive, with random actions and without, beside dynamic programming."""
+    from countersteer.batch.engine import flags
+
+    cores = os.cpu_count() or 1
+    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    from countersteer.car.files import load_car
+    from countersteer.compiling import configure_jax
+    from countersteer.course.files import load_course
+    from countersteer.learning import online, tabular
+    from countersteer.runs.files import csv_text
+    from countersteer.viewing.learners import draw_learners
+    from countersteer.writing import whole, write_whole
+
+    configure_jax(blocks=True, cores=cores)
+    course, car = load_course(options.course), load_car(options.car)
+    job = tabular_job(options, course, car, online.DIMENSIONS, online.WEIGHTS)
+    say(options, f"{job.table.size:,} states; compiles for a minute or two first")
+    learners = online.Online(job, options.seconds)
+    found = {}
+    with Progress(options.json) as progress:
+        for i, name in enumerate(("exploring", "greedy")):
+
+            def report(done: int, before: int = i) -> None:
+                progress.show(before + done / online.TESTS, 2)
+
+            found[name] = learners.learn(options.learners, options.seed, i == 0, report)
+            last = found[name][1].metres[:, -1]
+            say(options, f"  {name}: {', '.join(f'{m:.1f}' for m in last)} m in "
+                f"{online.TEST:g} s, up to a touch")  # fmt: skip
+    planned = tabular.learn(job, cores, look=learners.test)
+    say(options, f"  dynamic programming: {planned.solution.curve[-1]['metres']:.1f} m")
+    values, curves = found["exploring"]
+    best = int(curves.metres[:, -1].argmax())
+    cost = {"samples": curves.driven[-1] / job.decision, "cpu_s": float(curves.cpu[-1])}
+    how = {"method": "real-time dynamic programming", "seed": options.seed + best}
+    kept = online.unwrapped(job.table.pose, values[best])
+    write_whole(options.out, tabular.policy_file(job, kept, how, cost))
+    rows = [
+        [name, options.seed + i, driven, cpu, metres]
+        for name, (_, told) in found.items()
+        for i, line in enumerate(told.metres)
+        for driven, cpu, metres in zip(told.driven, told.cpu, line, strict=True)
+    ]
+    columns = ["learner", "seed", "driven_s", "cpu_s", "metres_m"]
+    write_whole(options.out.with_suffix(".csv"), csv_text(columns, rows))
+    picture = options.out.with_suffix(".png")
+    begun = planned.cost["cpu_s"] - planned.solution.curve[-1]["cpu_s"]
+    sweeps = [(begun + row["cpu_s"], row["metres"]) for row in planned.solution.curve]
+    with whole(picture) as part:
+        told = {name: curves for name, (_, curves) in found.items()}
+        draw_learners(told, sweeps, f"learn online: {course.name}, {job.car_name}", part)
+    result = {
+        "policy": str(options.out),
+        "picture": str(picture),
+        "states": job.table.size,
+        "cost": cost,
+        "metres_m": {name: told.metres[:, -1].tolist() for name, (_, told) in found.items()},
+        "driven_s": curves.driven.tolist(),
+        "dynamic_programming": {"cost": planned.cost, "sweeps": planned.solution.curve},
+    }
+    if options.json:
+        print(json.dumps(result))
+        return DONE
+    print(f"policy: {options.out}; picture: {picture}; curves: {options.out.with_suffix('.csv')}")
+    return DONE
+
+
 def run_optimum(options: argparse.Namespace) -> int:
     """`learn optimum`."""
     with out_file(options.out, ".csv"):
@@ -244,7 +460,7 @@ def learn_optimum(options: argparse.Namespace) -> int:
     from countersteer.cli.recorded import summary_lines
     from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
-    from countersteer.drivers.ppo import fingerprint
+    from countersteer.drivers.stored import fingerprint
     from countersteer.experiments.best_drive import best, judged, planned
     from countersteer.planning.mppi import KNOT
     from countersteer.runs.files import COMMANDS, command_rows, csv_text

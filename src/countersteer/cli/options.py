@@ -179,8 +179,8 @@ def physics(made: Parser, car: str | None) -> None:
     made.out_folder()
 
 
-def laps_and_link(made: Parser) -> None:
-    """`--laps`, `--link` and `--estimate`."""
+def laps_and_link(made: Parser, estimates: bool = False) -> None:
+    """`--laps`, `--link` and `--estimate`, of which there may be several."""
     made.option("--laps", "N", number(1, 1000, int), 1, "of a closed course")
     meaning = "where the driver runs: in the car, or behind a radio that delays and loses packets"
     made.option("--link", None, str, "onboard", meaning, choices=("onboard", "radio"))
@@ -188,8 +188,10 @@ def laps_and_link(made: Parser) -> None:
         "what the driver knows of its motion: by the velocity filter, by dead reckoning, or by a "
         "particle filter of the pose (slower), all from the sensors; or the truth"
     )
-    kinds = ("filter", "pose", "reckoning", "truth")
-    made.option("--estimate", None, str, "filter", meaning, choices=kinds)
+    more: dict[str, Any] = {"choices": ("filter", "pose", "reckoning", "truth")}
+    if estimates:
+        more, meaning = more | {"nargs": "+"}, f"{meaning}; several give a row each"
+    made.option("--estimate", None, str, "filter", meaning, **more)
 
 
 def plans() -> dict[str, str]:

@@ -56,15 +56,18 @@ class Way(NamedTuple):
         return place
 
 
-def way_of(course: Course) -> Way:
-    """The tables of a course with a centre line, in 32 bits. Raises `InputError` for free walls."""
+def way_of(course: Course, rounding: float = ROUNDING) -> Way:
+    """The tables of a course with a centre line, in 32 bits. Raises `InputError` for free walls.
+
+    `rounding` is in corridor widths, as `ROUNDING`.
+    """
     from scipy import ndimage  # a tenth of a second, which a drive without a way need not wait for
 
     if not len(course.line):
         raise InputError(f"{course.name}: free walls have no centre line to follow")
     width = course.width or 1.0
     points = _even(course)
-    sigma = ROUNDING * width / SPACING
+    sigma = rounding * width / SPACING
     if course.closed:
         points = ndimage.gaussian_filter1d(points, sigma, axis=0, mode="wrap")
         steps = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)

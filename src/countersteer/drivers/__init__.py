@@ -5,5 +5,6 @@ DRIVERS = (
     "straighten",
     "pursuit",
     "ppo",
+    "tabular",
     "optimum",
 )  # of the library; `plan.library` names its plans

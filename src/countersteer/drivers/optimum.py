@@ -10,7 +10,7 @@ from pathlib import Path
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers.ppo import fingerprint
+from countersteer.drivers.stored import fingerprint
 from countersteer.errors import InputError
 
 

@@ -1,16 +1,10 @@
 """A neural network that PPO taught: the estimate and the way ahead in, a command out.
 
 It is a multilayer perceptron with tanh units, learned by `learn ppo`. It decides every
-`PERIOD`. Its inputs are `features`. Its file is an `.npz` of plain numbers: arrays
-of Python objects are refused (NumPy's default).
+`PERIOD`. Its inputs are `features`. Its file is one of `drivers.stored`.
 """
 
-import hashlib
-import importlib.resources
-import json
-import math
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +16,7 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.course.way import Way, start_of, way_of
+from countersteer.drivers import stored
 from countersteer.drivers.driver import Observation, paced
 from countersteer.errors import InputError
 from countersteer.reading.values import short, shown
@@ -36,7 +31,6 @@ SPEED, RATE = 3.0, 6.0  # m/s and rad/s that count as 1
 FAR = 10.0  # no input is beyond
 FEATURES = 6 + 2 * len(AHEAD) + 5 * PAST
 MOST_UNITS = 4096
-LARGEST = 10_000_000  # bytes of a file
 
 
 class Layer(NamedTuple):
@@ -162,28 +156,19 @@ def network_driver(course: Course, car: Car, layers: tuple[Layer, ...]) -> Netwo
     return NetworkDriver(way=way, place=start_of(course, way), layers=layers, lock=full_lock(car))
 
 
-def network_arrays(layers: tuple[Layer, ...], about: Mapping[str, Any]) -> dict[str, Any]:
+def network_file(layers: tuple[Layer, ...], about: Mapping[str, Any]) -> bytes:
     """The content of a network's file: `about` tells course, car and where it is from."""
     told = {"kind": KIND, "format": FORMAT, "features": FEATURES, **about}
-    found: dict[str, Any] = {"about": np.frombuffer(json.dumps(told).encode(), np.uint8)}
+    found: dict[str, Any] = {}
     for i, layer in enumerate(layers):
         found |= {f"weight_{i}": np.asarray(layer.weight), f"bias_{i}": np.asarray(layer.bias)}
-    return found
+    return stored.packed(found, told)
 
 
 def read_network(path: Path) -> tuple[tuple[Layer, ...], dict[str, Any]]:
     """The layers in a file, and what it says about itself. Raises `InputError` in one line."""
     where = short(str(path))
-    try:
-        if path.stat().st_size > LARGEST:
-            raise InputError(f"{where}: over {LARGEST / 1e6:.0f} MB, which no policy is")
-        with np.load(path) as file:
-            held = {name: file[name] for name in file.files}
-        about = json.loads(held.pop("about").tobytes().decode())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{where}: is no policy of 'learn ppo': {error}") from None
-    if not isinstance(about, dict) or about.get("kind") != KIND:
-        raise InputError(f"{where}: is no policy of 'learn ppo'")
+    held, about = stored.read(path, KIND)
     if about.get("format") != FORMAT or about.get("features") != FEATURES:
         raise InputError(
             f"{where}: is of another version (format {shown(about.get('format'))}, "
@@ -208,52 +193,3 @@ def read_network(path: Path) -> tuple[tuple[Layer, ...], dict[str, Any]]:
     if not layers or width != 2:
         raise InputError(f"{where}: its last layer has {width} outputs, not throttle and steering")
     return tuple(layers), about
-
-
-def fingerprint(course: Course, car: Car) -> dict[str, str]:
-    """Digests of what a policy is for: the course, and the car without its sensors."""
-    goal = math.nan if course.goal_distance is None else course.goal_distance
-    place = np.array([*course.start, course.start_distance, goal])
-    parts = (car.body, car.tires, car.drivetrain, car.motor, car.battery, car.servo)
-    return {
-        "course": _digest([course.walls, course.line, place]),
-        "car": _digest([leaf for leaf in jax.tree.leaves(parts) if not isinstance(leaf, str)]),
-    }
-
-
-def _digest(arrays: Sequence[Any]) -> str:
-    """A digest of numbers, to nine decimals: they come from decimal files."""
-    found = hashlib.sha256()
-    for array in arrays:
-        found.update((np.round(np.asarray(array, np.float64), 9) + 0.0).tobytes())
-    return found.hexdigest()[:16]
-
-
-def check_for(where: str, about: Mapping[str, Any], course: Course, car: Car) -> None:
-    """Refuse a policy of another course or car, with one line."""
-    mine, theirs = fingerprint(course, car), about.get("fingerprint", {})
-    for key in ("course", "car"):
-        if not isinstance(theirs, Mapping) or theirs.get(key) != mine[key]:
-            raise InputError(
-                f"{where}: was learned for the {key} {shown(about.get(key))}, which this is not; "
-                f"learn one: countersteer learn ppo {course.name} --out POLICY.npz"
-            )
-
-
-def policy_for(course: Course, car: Car) -> Path:
-    """The library's policy for a course and a car. Raises `InputError` if there is none."""
-    mine = fingerprint(course, car)
-    for path in library():
-        if read_network(path)[1].get("fingerprint") == mine:
-            return path
-    raise InputError(
-        f"no policy is stored for the course {course.name} with this car; "
-        f"learn one: countersteer learn ppo {course.name} --out POLICY.npz, "
-        "then give --driver POLICY.npz"
-    )
-
-
-def library() -> list[Path]:
-    """The files of the library's policies."""
-    folder = Path(str(importlib.resources.files("countersteer.drivers") / "policies"))
-    return sorted(folder.glob("*.npz"))

@@ -1,5 +1,6 @@
 """Drivers by their names on the command line, and by their tables in `run.toml`."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 
 from countersteer.car.car import Car
 from countersteer.course.course import Course
-from countersteer.drivers import DRIVERS, optimum, own, plan, policy, ppo
+from countersteer.drivers import DRIVERS, optimum, own, plan, policy, ppo, stored, tabular
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
@@ -20,6 +21,7 @@ from countersteer.reading.values import short, shown
 from countersteer.text import nearest, read_toml
 
 KINDS = (policy.KIND, "plan")  # of a file
+LEARNED = (ppo.KIND, tabular.KIND)  # of an .npz
 
 
 def make_driver(
@@ -49,9 +51,10 @@ def make_driver(
         return own.own_driver(name, course, car, speed, laps), {"kind": "python", "name": name}
     if name in ("straighten", "pursuit"):
         tables = {"kind": name, **tables}
-    elif name == ppo.KIND or name.endswith(".npz"):
-        file = ppo.policy_for(course, car) if name == ppo.KIND else Path(name)
-        tables = {"kind": ppo.KIND, "file": str(file), **tables}
+    elif name in LEARNED:
+        tables = {"kind": name, "file": str(stored.policy_for(name, course, car)), **tables}
+    elif name.endswith(".npz"):
+        tables = {"kind": stored.kind_of(Path(name)), "file": name, **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
         kind = numbers.get("kind")
@@ -79,17 +82,51 @@ def driver_of_tables(
         return straighten(course, car, speed)
     if kind == "pursuit":
         return pursuit(course, car, speed)
-    if kind == ppo.KIND:
+    if kind in LEARNED:
         if speed is not None:
             raise InputError(
                 f"--speed-mps: {short(where)} has its own speed, and is asked for none"
             )
-        layers, about = ppo.read_network(Path(where))
-        ppo.check_for(short(where), about, course, car)
-        return ppo.network_driver(course, car, layers)
+        return learned(str(kind), Path(where), course, car)
     if kind == policy.KIND and numbers:
         return drift_turn(course, car, speed, laps, *policy.policy_of_tables(numbers, where))
     raise InputError(f"{short(where)}: no driver of kind {shown(kind)} can be made from plain data")
+
+
+def learned(kind: str, file: Path, course: Course, car: Car) -> Driver:
+    """The driver of a learned policy's file. Raises `InputError`."""
+    if kind == ppo.KIND:
+        layers, about = ppo.read_network(file)
+        stored.check_for(short(str(file)), about, course, car)
+        return ppo.network_driver(course, car, layers)
+    arrays, about, table = tabular.read_table(file)
+    stored.check_for(short(str(file)), about, course, car)
+    return tabular.table_driver(course, car, arrays, about, table)
+
+
+def steers_by(tables: Mapping[str, Any]) -> str:
+    """What a driver steers by, in a few words, by its table."""
+    kind = tables.get("kind")
+    if kind in ("straighten", policy.KIND):
+        return "sonar, and the estimate's velocities"
+    if kind in (*LEARNED, "pursuit"):
+        return "the estimate's pose"
+    return {"replay": "the clock", "plan": "its plan"}.get(str(kind), "what its code asks for")
+
+
+def learned_at(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """What a driver cost to learn, by its file: `samples` and `cpu_s`, as far as it says so."""
+    kind = tables.get("kind")
+    if kind not in LEARNED:
+        return {}
+    about = stored.read(Path(str(tables["file"])), str(kind))[1]
+    parts = [about.get("learned_with"), about.get("cost")]
+    told = {key: value for part in parts if isinstance(part, dict) for key, value in part.items()}
+    return {
+        key: float(told[key])
+        for key in ("samples", "cpu_s")
+        if isinstance(told.get(key), int | float) and math.isfinite(told[key])
+    }
 
 
 def replay(commands: Mapping[str, np.ndarray]) -> Replay | SpeedReplay:

@@ -11,11 +11,10 @@ High-Dimensional Continuous Control Using Generalized Advantage Estimation, arXi
 
 import dataclasses
 import functools
-import io
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,8 +24,7 @@ import numpy as np
 import optax
 from jax.sharding import NamedSharding, PartitionSpec
 
-from countersteer.batch import engine
-from countersteer.batch.evaluate import Trials, results
+from countersteer.batch import engine, evaluate
 from countersteer.batch.population import Population
 from countersteer.car.car import Car
 from countersteer.course.course import Course
@@ -34,20 +32,18 @@ from countersteer.drivers.ppo import (
     FEATURES,
     PERIOD,
     Layer,
-    fingerprint,
     network,
-    network_arrays,
     network_driver,
+    network_file,
     read_network,
 )
+from countersteer.drivers.stored import fingerprint
 from countersteer.envs.functional import LONGEST, Environment, Lane, Own, owns
-from countersteer.errors import InputError
 from countersteer.learning import checkpoint
 from countersteer.learning.curves import save
-from countersteer.link.link import ONBOARD
 from countersteer.signals import Array, Scalar
 from countersteer.task.judge import DRIFT, Outcome
-from countersteer.task.reward import DRIFTING, Reward
+from countersteer.task.reward import Reward
 from countersteer.writing import write_whole
 
 UNITS = (64, 64)
@@ -406,26 +402,6 @@ PANELS = (  # of the picture
 )
 
 
-def weights_of(changes: Sequence[str]) -> Reward:
-    """The default reward with changes such as `sideslip=5`. Raises `InputError`."""
-    weights = DRIFTING
-    for change in changes:
-        name, _, value = change.partition("=")
-        if name not in Reward._fields:
-            raise InputError(
-                f"--reward {change}: there is no term {name!r}: give one of "
-                + ", ".join(Reward._fields)
-            )
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
-            raise InputError(f"--reward {change}: {value!r} is not a number")
-        weights = weights._replace(**{name: number})
-    return weights
-
-
 def checkpoint_of(out: Path) -> Path:
     """The checkpoint of a policy that is being learned."""
     return out.with_suffix(".checkpoint.npz")
@@ -490,12 +466,11 @@ def train(
         "car": job.car_name,
         "task": "lap",
         "learned_with": {key: about[key] for key in ("cars", "reward", "seed", "samples")},
+        "cost": {"samples": curves[-1]["samples"], "cpu_s": curves[-1]["cpu_s"]},
         "fingerprint": about["fingerprint"],
     }
     mean = jax.tree.map(np.asarray, state.mean)
-    buffer = io.BytesIO()
-    np.savez(buffer, **network_arrays(mean.actor, source))
-    write_whole(out, buffer.getvalue())
+    write_whole(out, network_file(mean.actor, source))
     title = f"learn ppo: {job.course.name}, {job.car_name}, seed {job.seed}"
     save(curves, out, title, "samples", ("million decisions", 1e6), PANELS)
     kept.unlink(missing_ok=True)
@@ -520,9 +495,5 @@ def line(told: dict[str, float]) -> str:
 
 def verdict(job: Job, policy: Path, first: int, count: int = 256) -> dict[str, Any]:
     """The results of a policy's file, as `evaluate`'s with `--estimate truth`."""
-    seeds = [(first + i) % 2**31 for i in range(count)]
     driver = network_driver(job.course, job.car, read_network(policy)[0])
-    trials = Trials(
-        job.course, job.car, job.car, job.population, seeds, None, 1, ONBOARD, "truth", 0.001
-    )
-    return results(trials.run(lambda _: driver), seeds)
+    return evaluate.verdict(job.course, job.car, job.population, driver, first, count)

@@ -6,10 +6,12 @@ corridor.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from countersteer.errors import InputError
 from countersteer.signals import Command, Scalar
 from countersteer.task.judge import DRIFT, Outcome, Score, Task
 
@@ -78,3 +80,23 @@ def reward(
     )
     dtype = jnp.result_type(weights.time)
     return Reward(*(jnp.asarray(term, dtype) for term in terms))
+
+
+def weights_of(
+    changes: Sequence[str], weights: Reward, terms: Sequence[str] = Reward._fields
+) -> Reward:
+    """The weights with changes such as `sideslip=5`, to these terms. Raises `InputError`."""
+    for change in changes:
+        name, _, value = change.partition("=")
+        if name not in terms:
+            raise InputError(
+                f"--reward {change}: there is no term {name!r}: give one of " + ", ".join(terms)
+            )
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise InputError(f"--reward {change}: {value!r} is not a number")
+        weights = weights._replace(**{name: number})
+    return weights
