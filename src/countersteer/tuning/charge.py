@@ -59,7 +59,8 @@ def from_voltmeter(run: Run, car: Car, measured: Measured, dt: float) -> tuple[C
     volts = volts[::every]
     first, last = run.commands["time_s"][[0, -1]]
     ticks = np.arange(int(max(last, at[-1]) / dt) + 2)
-    duty = windows.actuators(car, *windows.asked(run.commands, ticks, dt), dt)[1]
+    commands = windows.asked(run.commands, ticks, dt)
+    duty = windows.actuators(car, measured, commands, dt)[1]
     duty = duty[np.clip(np.rint(at / dt).astype(int), 0, len(duty) - 1)]
     shaft = shaft_speed(car, measured, at)
     usable = (at >= first) & (at <= last) & (np.isfinite(shaft) | (np.abs(duty) < 1e-3))

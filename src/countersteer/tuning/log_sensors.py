@@ -381,7 +381,7 @@ def course_of(run: Run, car: Car, measured: Measured, dt: float) -> Course:
     vx, vy, rate = (s.value[rows] for s in (measured.vx, measured.vy, measured.yaw_rate))
     last = max(1, int(max(time[-1], run.commands["time_s"][-1]) / dt) + 1)
     commands = windows.asked(run.commands, np.arange(last), dt)
-    angle = windows.actuators(car, *commands, dt)[0]
+    angle = windows.actuators(car, measured, commands, dt)[0]
     steering = np.interp(time, dt * np.arange(len(angle)), angle)
     return Course(time, vx, vy, rate, steering)
 

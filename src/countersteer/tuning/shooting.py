@@ -86,7 +86,7 @@ def take(
         return None
     time = starts * dt
     whole = asked(run.commands, np.arange(int(starts.max()) + 1), dt)
-    angle = windows.actuators(car, *whole, dt)[0][starts]
+    angle = windows.actuators(car, measured, whole, dt)[0][starts]
     vx, vy, yaw_rate, ax, ay = body_at(car, measured, angle, time, resting)
     references = find_references(measured)
     after = time[:, None] + SAMPLE * np.arange(1, round(horizon / SAMPLE) + 1)

@@ -336,8 +336,7 @@ def states_at(
     time = starts * dt
     ticks = np.arange(int(starts.max()) + 1)
     commands = asked(run.commands, ticks, dt)
-    rims = rims_at(measured, ticks * dt) if isinstance(commands, SpeedCommand) else None
-    angle, duty = (trace[starts] for trace in actuators(car, commands, rims, dt))
+    angle, duty = (trace[starts] for trace in actuators(car, measured, commands, dt))
     zero = np.zeros(len(time))
     vx, vy, yaw_rate, ax, ay = body_at(car, measured, angle, time, resting)
     wheels = wheels_at(car, measured, Vector(vx, vy, yaw_rate), angle, time, resting)
@@ -479,13 +478,16 @@ def asked(commands: Table, ticks: np.ndarray, dt: float) -> AnyCommand:
 
 
 def actuators(
-    car: Car, commands: AnyCommand, rims: np.ndarray | None, dt: float
+    car: Car, measured: Measured, commands: AnyCommand, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Steering angle (rad) and duty at the start of each tick, for the commands of all ticks.
 
     The laws and delays are those of `planar.step`. Only a speed controller depends on the motion:
-    it measures `rims`, the rim speeds (m/s).
+    it is told the measured speed of the rims.
     """
+    rims = None
+    if isinstance(commands, SpeedCommand):
+        rims = rims_at(measured, dt * np.arange(len(commands.steering)))
     state = planar.initial_state(car, dt)
     # In pieces: one call for a whole log would be compiled for its length, and it would be slow.
     ticks = len(commands.steering)
