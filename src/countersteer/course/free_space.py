@@ -94,8 +94,8 @@ def way_between(
     if not (0 <= row < region.shape[0] and 0 <= column < region.shape[1] and region[row, column]):
         return None
     source, target = (_nearest(free > 0, place / stride) for place in (begin, end))
-    _, before = csgraph.dijkstra(
-        graph.tocsr(), directed=False, indices=source, return_predecessors=True
+    _, (before,) = csgraph.dijkstra(
+        graph.tocsr(), directed=False, indices=np.array([source]), return_predecessors=True
     )
     cells = [target]
     while before[cells[-1]] >= 0:
