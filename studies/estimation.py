@@ -469,8 +469,10 @@ believes is from the truth, and what becomes of the turns.
 ## What better sensing would bring
 
 The same driver. With a lidar, the beams on the side walls correct the wall filter, and those ahead
-tell the corner instead of the front sonar. With a place from outside, that is among the velocity
-filter's states, and the driver takes offset, angle and corner from the pose.
+tell the corner instead of the front sonar. Behind a corner the wall filter begins at the place that
+the corridor before tells. Otherwise beams are taken for those of other walls. With a place from
+outside, that is among the velocity filter's states, and the driver takes offset, angle and corner
+from the pose.
 
 {sensing}
 """

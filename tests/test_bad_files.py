@@ -601,6 +601,7 @@ RIGHT = {
     "bad-toml-long-int": (["list", "parameters", "--car", "c.toml"], 2, "too large"),
     "bad-yaml-alias-bomb": (["drive", "m.yaml"], 2, "aliases"),
     "bad-yaml-merge-bomb": (["drive", "m.yaml"], 2, "aliases"),
+    "waypoints-x-y-yaw-speed": (["drive", "waypoints.csv"], 2, "is the heading of the line"),
     "dart-blank-last-line": (["import", "dart", "log.csv", "good.csv", "--out", "OUT"], 0, ""),
     "speed-commanded": (["replay", "commands.csv", "--out", "OUT"], 2, "column speed_mps"),
     "own-log-gyro-degps": (["replay", ".", "--compare", "--out", "OUT"], 2, "in degrees"),

@@ -15,7 +15,7 @@ from scipy.sparse import csgraph
 SMOOTH = 4.0  # standard deviation of the filter along a line
 SPACING = 2.0  # between two points of a line
 OBSTACLE = 0.5  # of the island's area: a larger patch is no obstacle
-MOST_CELLS = 250_000  # of the grid on which a way is searched
+MOST_CELLS = 500_000  # of the grid on which a way is searched
 
 
 def ring_walls(solid: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -94,8 +94,8 @@ def way_between(
     if not (0 <= row < region.shape[0] and 0 <= column < region.shape[1] and region[row, column]):
         return None
     source, target = (_nearest(free > 0, place / stride) for place in (begin, end))
-    _, before = csgraph.dijkstra(
-        graph.tocsr(), directed=False, indices=source, return_predecessors=True
+    _, (before,) = csgraph.dijkstra(
+        graph.tocsr(), directed=False, indices=np.array([source]), return_predecessors=True
     )
     cells = [target]
     while before[cells[-1]] >= 0:
