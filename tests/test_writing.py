@@ -23,11 +23,11 @@ from countersteer.progress import Progress, _Wait
 from countersteer.runs.files import COMMANDS, csv_text, read_table, write_table
 from countersteer.runs.recorder import Recorder, new_folder, whole_folder
 from countersteer.runs.run import read_run
-from countersteer.viewing.view import MOTION, WHEELS
+from countersteer.viewing.view import COLUMNS
 from countersteer.writing import BusyError, alone, whole, write_together, write_whole
 from studies.kills import kills, prepare
 
-TRUTH = ("time_s", "x_m", "y_m", "heading_rad", *MOTION, *(f"wheel_{w}_radps" for w in WHEELS))
+TRUTH = ("time_s", "x_m", "y_m", "heading_rad", *COLUMNS)
 COUNT = 40  # rows of a run
 
 
