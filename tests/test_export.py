@@ -147,6 +147,15 @@ def test_a_run_with_only_poses_is_drawn_too(tmp_path, capsys):
     assert told["frames"] == 20
 
 
+def test_an_animation_of_poses_shows_speed_and_sideslip_as_that_of_velocities_does(tmp_path):
+    for velocities in (True, False):
+        run = write_run(tmp_path / f"run{velocities}", circle(velocities))
+        speed, sideslip, yaw_rate, _ = Animation(read_run(run), Options())._strips
+        assert (speed.name, sideslip.name, yaw_rate.name) == ("Speed", "Sideslip", "Yaw rate")
+        np.testing.assert_allclose(speed.values[20:-20], 1, atol=0.002)
+        np.testing.assert_allclose(sideslip.values[20:-20], 20, atol=0.1)
+
+
 def test_what_cannot_be_drawn_is_told_in_one_line(run, tmp_path, capsys):
     blind = write_run(tmp_path / "blind", None)
     for source, options, message in (

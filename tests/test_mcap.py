@@ -112,7 +112,7 @@ def test_the_schemas_parse_and_the_messages_hold_to_them(box):
         summary = make_reader(file).get_summary()
     schemas = {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
     of_json = {topic: s for topic, s in schemas.items() if s.encoding == "jsonschema"}
-    assert set(of_json) == {"/commands", "/telemetry", "/truth", "/motion"}
+    assert set(of_json) == {"/commands", "/telemetry", "/truth", "/motion", "/estimate"}
     for topic, schema in of_json.items():
         content = json.loads(schema.data)
         jsonschema.Draft202012Validator.check_schema(content)

@@ -7,12 +7,15 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from countersteer import cli
+from countersteer.errors import InputError
+from countersteer.recorded_drive import Watched
 from countersteer.runs.run import read_run
 from countersteer.viewing import viewer
 from countersteer.viewing.page import FOLDER as TEMPLATES
@@ -128,9 +131,10 @@ def test_each_module_is_in_the_page_once_and_no_page_has_code_of_its_own():
     assert files | {"look.js"} == set(scripts())
     page = report_html(made_view())
     for name, text in scripts().items():
-        lines = [line for line in text.splitlines() if not line.startswith(("import", "export"))]
-        last = next(line for line in reversed(lines) if len(line) > 20)
-        assert page.count(last) >= 1, name
+        exported = re.findall(r"^export (\w+ \w+)", text, re.MULTILINE)
+        assert exported or name == "report.js"
+        for one in exported:
+            assert len(re.findall(rf"^{one}\b", page, re.MULTILINE)) == 1, one
     bundle = viewer.bundle("report.js")
     assert not re.search(r"^(import|export)\b", bundle, re.MULTILINE)
     assert "</script" not in bundle
@@ -222,6 +226,48 @@ def test_lost_commands_of_a_radio_are_the_gaps_between_those_that_came(tmp_path)
         file.write("link.name = 'radio'\nrates.control_s = 0.1\n")
     lost = [event for event in view_of(read_run(run))["events"] if event["kind"] == "lost"]
     assert [(round(e["from_s"], 6), e["to_s"]) for e in lost] == [(0.22, 0.32)]
+
+
+def test_the_ellipse_of_the_estimate_is_two_deviations_along_the_axes_of_its_covariance(tmp_path):
+    run = write_log(tmp_path / "run", True)
+    columns = "time_s,x_m,y_m,heading_rad,vx_mps,vy_mps,yaw_rate_radps,xx_m2,xy_m2,yy_m2"
+    turned = "0.025,0.015,0.025"  # 0.04 and 0.01 m², the longer axis at 45°
+    (run / "estimate.csv").write_text(
+        f"{columns}\n0,0,0,0,1,0,0,0.04,0,0.01\n1,0,0,0,1,0,0,{turned}\n2,0,0,0,1,0,0,0,0,0\n"
+    )
+    found = view_of(read_run(run))["estimate"]
+    np.testing.assert_allclose(found["longer_m"], [0.4, 0.4, 0], atol=1e-9)
+    np.testing.assert_allclose(found["shorter_m"], [0.2, 0.2, 0], atol=1e-9)
+    np.testing.assert_allclose(found["ellipse_rad"][:2], [0, math.pi / 4], atol=1e-9)
+
+
+def test_what_a_planner_looks_at_is_noted_ten_times_a_second():
+    class Planner:
+        period = 0.02
+
+        def reset(self, key: Any) -> int:
+            return 0
+
+        def act(self, memory: int, observation: Any) -> tuple[str, int]:
+            return "command", memory + 1
+
+        def rollouts(self, memory: int, observation: Any, count: int) -> Any:
+            paths = SimpleNamespace(x=np.full((2, 4), float(memory)), y=np.zeros((2, 4)))
+            plan = SimpleNamespace(x=np.ones(4), y=np.ones(4))
+            return SimpleNamespace(motion=paths, cost=np.array([3.0, np.nan]), plan=plan)
+
+    watched, memory = Watched(Planner()), 0
+    for step in range(16):
+        command, memory = watched.act(memory, SimpleNamespace(time=0.02 * step))
+        assert command == "command"
+    time, rollout, cost, x, _ = watched.columns(0.25)
+    assert sorted(set(time)) == pytest.approx([0, 0.1, 0.2])
+    assert list(rollout[:6]) == [0, 0, 1, 1, 2, 2]
+    assert cost[0] == 3
+    assert list(x[2:4]) == [0, 0]
+    assert sorted(set(watched.columns(0.35)[0])) == pytest.approx([0.3])
+    with pytest.raises(InputError, match="mppi"):
+        Watched(object())
 
 
 def test_at_the_same_place_a_slower_drive_is_later_and_at_the_same_time_it_is_behind():

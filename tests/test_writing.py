@@ -23,11 +23,11 @@ from countersteer.progress import Progress, _Wait
 from countersteer.runs.files import COMMANDS, csv_text, read_table, write_table
 from countersteer.runs.recorder import Recorder, new_folder, whole_folder
 from countersteer.runs.run import read_run
-from countersteer.viewing.view import MOTION, WHEELS
+from countersteer.viewing.view import COLUMNS
 from countersteer.writing import BusyError, alone, whole, write_together, write_whole
 from studies.kills import kills, prepare
 
-TRUTH = ("time_s", "x_m", "y_m", "heading_rad", *MOTION, *(f"wheel_{w}_radps" for w in WHEELS))
+TRUTH = ("time_s", "x_m", "y_m", "heading_rad", *COLUMNS)
 COUNT = 40  # rows of a run
 
 
@@ -389,19 +389,18 @@ def test_report_makes_the_page_of_a_killed_drive(tmp_path, capsys):
     log = record(tmp_path / "log", truth=TRUTH[:4], log_format="dart")
     (tmp_path / "nothing").mkdir()
     runs = [str(run) for run in (log, killed, tmp_path / "nothing")]
-    assert main(["report", *runs, "--json"]) == WRONG_INPUT
+    assert main(["report", "--each", *runs, "--json"]) == WRONG_INPUT
     told = capsys.readouterr()
-    first, second = told.err.splitlines()
-    assert f"{log}/truth.csv: has no vx_mps" in first
-    assert "nothing: not a run" in second
+    (error,) = told.err.splitlines()
+    assert "nothing: not a run" in error
     found = json.loads(told.out)
-    assert len(found["errors"]) == 2
-    (made,) = found["reports"]
+    assert len(found["errors"]) == 1
+    of_log, made = found["reports"]
+    assert of_log["verdict"] == "not judged"
     verdict = "not finished: the record ends at 0.20 s"
     assert (made["outcome"], made["verdict"]) == ("not finished", verdict)
     assert verdict in Path(made["report"]).read_text(encoding="utf-8")
     assert Path(made["picture"]).read_bytes().startswith(b"\x89PNG")
-    assert not (log / "report.html").exists()
     assert main(["report", str(killed)]) == DONE
     assert capsys.readouterr().out == f"{killed}: {verdict}; report: {killed}/report.html\n"
 

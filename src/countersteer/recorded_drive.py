@@ -259,7 +259,7 @@ def drive(
     score, outcome = task.init(), Outcome.DRIVING
     # Who plays commands looks at no estimate, and the ground truth is recorded already.
     known = about["pilot"].get("kind") == "replay" or about["estimate"] == "truth"
-    more = {} if known else {"estimate": ESTIMATE}
+    more: dict[str, tuple[str, ...]] = {} if known else {"estimate": ESTIMATE}
     planner = pilot.driver if isinstance(pilot.driver, Watched) else None
     if planner is not None:
         more["rollouts"] = ROLLOUTS

@@ -132,7 +132,7 @@ def measured_start(run: "Run") -> dict[str, float] | None:
     poses = zip(*(run.truth[name].tolist() for name in names), strict=True) if run.truth else ()
     known = (pose for pose in poses if all(map(math.isfinite, pose)))
     first = next(known, None)
-    return first and dict(zip(names, first, strict=True))
+    return None if first is None else dict(zip(names, first, strict=True))
 
 
 def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:

@@ -3,6 +3,7 @@
 | topic | schema | content |
 | --- | --- | --- |
 | `/commands`, `/telemetry`, `/truth` | JSON | a message for each row of the table of that name |
+| `/estimate`, `/rollouts` | JSON | the same, where they are recorded |
 | `/motion` | JSON | speed, sideslip and yaw rate in display units, from the truth |
 | `/tf` | foxglove.FrameTransforms | `world` → `car` → four wheels, one frame for each sonar |
 | `/pose`, `/path` | foxglove.PoseInFrame, PosesInFrame | the car's pose, and its path so far |

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +97,7 @@ def styled() -> Iterator[None]:
     from cycler import cycler
 
     runs = [light(f"run-{k + 1}") for k in range(MOST_RUNS)]
-    settings = {
+    settings: dict[Any, Any] = {
         "figure.facecolor": PAPER,
         "savefig.facecolor": PAPER,
         "axes.facecolor": PAPER,

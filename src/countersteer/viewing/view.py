@@ -12,12 +12,10 @@ import numpy as np
 from countersteer.car.car import GRAVITY, Car, wheel_positions
 from countersteer.errors import InputError
 from countersteer.kept_programs import kept
-from countersteer.runs.defects import stretches
 from countersteer.runs.files import COVARIANCE, ROLLOUTS, Table, drive_column
 from countersteer.runs.run import Run, drawn_car
 from countersteer.signals import Array, Motion, Wheels
 from countersteer.task.turns import sideslip
-from countersteer.tuning.windows import read_measured
 from countersteer.world import planar
 from countersteer.world.floor import Floor, floor_of_run
 
@@ -149,6 +147,9 @@ def _simulated(run: Run) -> dict[str, np.ndarray]:
 
 def _measured(run: Run, car: Car) -> dict[str, np.ndarray]:
     """The motion of a real run: by motion capture, or else by the car's encoder and gyroscope."""
+    # It needs SciPy's filters, whose import takes longer than the page of a simulated drive.
+    from countersteer.tuning.windows import read_measured
+
     measured, truth = read_measured(run, car), run.truth
     shown: dict[str, np.ndarray] = {}
     if truth is not None and len(truth):
@@ -233,6 +234,8 @@ def events(run: Run) -> list[dict[str, Any]]:
             found.append(_event("lost", "command lost", came[i] + period, came[i + 1]))
     armed = (run.telemetry if run.telemetry is not None else Table()).get("armed")
     if armed is not None and run.telemetry is not None:
+        from countersteer.runs.defects import stretches  # it imports SciPy as well
+
         time = run.telemetry["time_s"]
         for first, last in stretches(armed < 0.5):
             end = time[min(last + 1, len(time) - 1)]

@@ -12,6 +12,9 @@ from countersteer.viewing.look import look_module
 
 FOLDER = importlib.resources.files("countersteer.viewing") / "viewer"
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./([\w-]+\.js)";\n', re.MULTILINE)
+# Whole lines of comment, and what stands before and between lines of code. No text of a module goes
+# over a line's end.
+_ASIDE = re.compile(r"^\s*/\*\*(?s:.*?)\*/\n|^\s*//.*\n|^\s+", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(async )?(function|const|let|class) )", re.MULTILINE)
 
 
@@ -35,5 +38,6 @@ def modules(entry: str) -> list[str]:
 
 
 def bundle(entry: str) -> str:
-    """The module `entry` with all that it imports, as the text of one script."""
-    return "\n".join(_EXPORT.sub("", _IMPORT.sub("", module(name))) for name in modules(entry))
+    """The module `entry` with all that it imports, as one script without comments and indents."""
+    text = "\n".join(_EXPORT.sub("", _IMPORT.sub("", module(name))) for name in modules(entry))
+    return _ASIDE.sub("", text)

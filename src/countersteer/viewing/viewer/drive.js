@@ -62,7 +62,11 @@ export function momentAt(drive, t) {
   const asked = Number.isFinite(steering) ? steering : read("steering_command_deg");
   const heading = drive.heading_rad?.[at.i] ?? NaN;
   const turned = (drive.heading_rad?.[at.j] ?? NaN) - heading;
+  const way = drive.x_m ? Math.cos(heading) * (drive.x_m[at.j] - drive.x_m[at.i])
+    + Math.sin(heading) * (drive.y_m[at.j] - drive.y_m[at.i]) : 0;
   return {
+    // Sideslip is 0 backwards, so it does not tell where a car goes that reverses.
+    backwards: way < 0 && read("sideslip_deg") === 0,
     i: at.i, t, x: read("x_m"), y: read("y_m"),
     // The heading may jump by a full turn from one sample to the next.
     heading: heading + at.part * Math.atan2(Math.sin(turned), Math.cos(turned)),

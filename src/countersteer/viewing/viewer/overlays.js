@@ -56,7 +56,7 @@ export function drawSideslip(pen, drive, moment, theme, fastest) {
 
 export function drawVelocity(pen, drive, moment, theme, fastest) {
   if (!moves(moment)) return;
-  const course = moment.heading + moment.sideslip * DEGREES;
+  const course = moment.heading + (moment.backwards ? Math.PI : moment.sideslip * DEGREES);
   const length = arrowLength(drive, moment, fastest);
   pen.arrow(moment.x, moment.y, moment.x + Math.cos(course) * length,
     moment.y + Math.sin(course) * length, theme.colour("velocity"), 3);
