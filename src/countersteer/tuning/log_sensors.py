@@ -272,6 +272,7 @@ class Solved(NamedTuple):
     value: np.ndarray  # (coefficients + 1,), the lag last
     deviation: np.ndarray
     spread: float  # robust standard deviation of the residuals
+    misfit: float = 0.0  # root mean square of all residuals, of outliers too
 
 
 def regression(
@@ -288,6 +289,7 @@ def regression(
     """
     designs = [design(lag) for lag in lags.tolist()]
     usable = np.isfinite(target) & np.all([np.isfinite(d).all(axis=1) for d in designs], axis=0)
+    known = usable.copy()
     for _ in range(3):
         if np.sum(usable) < FEWEST:
             return None
@@ -296,7 +298,7 @@ def regression(
         best = int(np.argmin(np.abs(lags - found.value[-1])))
         off = np.abs(target - designs[best] @ found.value[:-1])
         usable &= ~(off > OUTLYING * max(found.spread, FINEST))
-    return found
+    return found._replace(misfit=float(np.sqrt(np.mean(off[known] ** 2))))
 
 
 def _solved(
@@ -541,7 +543,8 @@ def gyro_lag(run: Run, gyro: Signal, course: Course) -> list[Estimate]:
 # -------------------------------------------------------------------------------------------------
 
 OTHER_WHEEL = 0.7  # residual of the best wheel over that of the declared one, for a warning
-BESIDE = 0.01  # m, prior deviation of the captured point to the left where wheels are compared
+AS_GOOD = 1.1  # residual over the least, of wheels that cannot be told apart
+BESIDE = 0.002  # m, prior deviation of the captured point to the left where wheels are compared
 
 
 def noise_warning(run: Run) -> list[str]:
@@ -560,18 +563,19 @@ def noise_warning(run: Run) -> list[str]:
 def wheel_warning(run: Run, car: Car, measured: Measured, course: Course) -> list[str]:
     """A line if the encoder seems to sit on another wheel than declared."""
     declared = windows.encoder_on(run, car)
-    spread = {}
+    misfit = {}
     for on in ENCODER_ON:
         fit = encoder_fit(car, measured, course, windows.shares(on, car), BESIDE)
         if fit is not None:
-            spread[on] = fit.spread
-    if declared not in spread:
+            misfit[on] = fit.misfit
+    if declared not in misfit:
         return []
-    best = min(spread, key=lambda on: spread[on])
-    if spread[best] > OTHER_WHEEL * spread[declared]:
+    least = min(misfit.values())
+    if least > OTHER_WHEEL * misfit[declared]:
         return []
+    likely = [on for on, off in misfit.items() if off < AS_GOOD * least]
     return [
-        f"the encoder reads as one on the {best} would (off by {spread[best]:.3f} m/s), not as one "
-        f'on the {declared} ({spread[declared]:.3f} m/s): write on = "{best}" under '
+        f"the encoder reads as one on the {' or '.join(likely)} would (off by {least:.3f} m/s), not "
+        f"as one on the {declared} ({misfit[declared]:.3f} m/s): change on under "
         "[sensors.encoder] of run.toml, unless the captured point is beside the middle"
     ]
