@@ -575,7 +575,7 @@ def wheel_warning(run: Run, car: Car, measured: Measured, course: Course) -> lis
         return []
     likely = [on for on, off in misfit.items() if off < AS_GOOD * least]
     return [
-        f"the encoder reads as one on the {' or '.join(likely)} would (off by {least:.3f} m/s), not "
-        f"as one on the {declared} ({misfit[declared]:.3f} m/s): change on under "
+        f"the encoder reads as one on the {' or '.join(likely)} would (off by {least:.3f} m/s), "
+        f"not as one on the {declared} ({misfit[declared]:.3f} m/s): change on under "
         "[sensors.encoder] of run.toml, unless the captured point is beside the middle"
     ]
