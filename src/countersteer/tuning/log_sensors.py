@@ -94,7 +94,7 @@ class Estimate(NamedTuple):
 
     kind: Kind
     declared: float
-    source: str  # of the declared one: run.toml, the car, or the run's convention
+    source: str  # of the declared one: run.toml, the car, or truth.csv by what the file means
     value: float  # estimated
     deviation: float
     used: str  # declared, estimated
@@ -184,7 +184,7 @@ def warning(one: Estimate) -> str:
     kind = one.kind
     plus = "" if one.deviation == 0 else f" ± {one.deviation:.2g}"
     line = (
-        f"{kind.what}: the log tells {one.value:.4g}{plus}, {one.source} {one.declared:.4g} "
+        f"{kind.what}: the log tells {one.value:.4g}{plus}, but {one.source} {one.declared:.4g} "
         f"({kind.key} under [sensors.{kind.sensor}] of run.toml)"
     )
     return f"{line}; the log's is used" if one.used == "estimated" else line
@@ -425,7 +425,7 @@ def capture_point(run: Run, car: Car, course: Course) -> list[Estimate]:
     found = regression(lambda _: design, target, course.time, np.zeros(1), prior)
     if found is None:
         return []
-    convention = (0.0, "its place in the file's truth.csv")
+    convention = (0.0, "truth.csv")
     own = sensor_tables(run.about, "capture")
     yaw, forward = (float(v) for v in found.value[:2])
     # The table was moved by what is declared. The estimate is what is left.
@@ -513,7 +513,7 @@ def encoder_lag(run: Run, car: Car, measured: Measured, course: Course) -> list[
         return []
     declared = (measured.encoder_timing.lag, "the car")
     y = aside / scale + sensor_tables(run.about, "capture").get("y_m", 0.0)
-    convention = (0.0, "its place in the file's truth.csv")
+    convention = (0.0, "truth.csv")
     return [
         estimated(run, "encoder", "lag_s", declared, lag, float(found.deviation[3])),
         estimated(run, "capture", "y_m", convention, y, float(found.deviation[1]) / scale),
