@@ -319,6 +319,14 @@ FAULTS: dict[str, tuple[Callable[[Run], Run], str, str, float]] = {
 
 # Each spoils a whole column. What must be said, and the place.
 REFUSED: dict[str, tuple[Callable[[Run], Run], str]] = {
+    "heading_mirrored": (
+        lambda r: changed(r, "truth", heading_rad=lambda t: -t["heading_rad"]),
+        "heading_rad turns against the course",
+    ),
+    "heading_from_another_axis": (
+        lambda r: changed(r, "truth", heading_rad=lambda t: t["heading_rad"] + np.pi),
+        "heading_rad is off the course",
+    ),
     "heading_in_degrees": (
         lambda r: changed(
             r, "truth", heading_rad=lambda t: (np.degrees(t["heading_rad"]) + 180) % 360 - 180
@@ -445,6 +453,20 @@ def test_a_heading_that_wraps_is_unwrapped_and_said():
     assert "unwrapped" in lines[0]
     assert find_defects(wrapped) == []
     assert repair(run) == (run, [])
+
+
+def test_a_quaternion_that_changes_its_sign_is_no_unit():
+    run = good()
+    flips = 2 * np.pi * (np.arange(len(run.truth)) % 40 < 5)
+    flipped = changed(run, "truth", heading_rad=lambda t: t["heading_rad"] + flips)
+    assert find_defects(flipped) == []
+
+
+def test_a_heading_that_turns_round_halfway_is_found():
+    run = good()
+    back = np.pi * (np.arange(len(run.truth)) > 500)
+    found = find_defects(changed(run, "truth", heading_rad=lambda t: t["heading_rad"] + back))
+    assert any("points backwards" in fault.what and fault.end > 8 for fault in found)
 
 
 def test_wheels_that_spin_and_a_gyroscope_at_its_reach_are_not_stuck():

@@ -151,7 +151,8 @@ def test_an_encoder_on_another_wheel_than_declared_is_named(driven):
         return resolve(run, load_car(CAR), DT).warnings
 
     assert warnings("front-left") == []
-    assert any('on = "front-left"' in line for line in warnings("shaft"))
+    # In these turns the rear left wheel is as fast.
+    assert any("front-left or rear-left" in line for line in warnings("shaft"))
 
 
 def test_velocities_move_with_the_point():

@@ -32,6 +32,7 @@ TAIL, NORMAL_TAIL = 0.8, 1.2816  # quantile of a size, and the same of a normal 
 ABRUPT, ABRUPT_YAW = 3.0, 20.0  # m/s, rad/s; largest excess of a rate over the median around it
 AROUND = 0.3  # s, window of that median
 STANDS = 0.1  # m/s; a slower car may repeat a frame
+REVERSED = 1.0  # s; a spin takes less, and braking from reverse too
 FALSE_YAW_RATE = 3.0  # rad/s off the heading's rate; correct ones in the logs reach 1.3
 
 # Collisions. The best tyre on rubber reaches about 1 g. The hardest braking in the logs is 0.98 g,
@@ -55,6 +56,9 @@ STEERED = math.radians(5)  # rad; so much steering, or change of it, turns a mov
 FASTEST, FASTEST_YAW = 30.0, 60.0  # m/s, rad/s; no model car reaches them
 STEEPEST = math.radians(65)  # rad, the largest steering limit that a car may declare
 DEGREES = (45.0, 72.0)  # range of value / true value if the value is in degrees
+TURN_WITHIN = 0.5  # rad, off a whole turn
+ALIGNED, SIDEWAYS = 0.8, math.radians(75)  # concentration of an angle; no drift has such sideslip
+MIRRORED = 1.5  # factor within which a heading turns as the course
 COARSE = 2.5  # factor within which speed, steering and a guessed wheelbase tell a yaw rate
 SERVO = 0.3  # s, by which the front wheels have followed the command
 SLOW = 0.2  # m/s; a slower car does not tell its yaw rate
@@ -107,6 +111,7 @@ def find_defects(run: Run) -> list[LogDefect]:
     track = None
     if run.truth is not None:
         found += [*repeated_frames(run.truth), *jumps(run.truth), *false_yaw_rates(run.truth)]
+        found += backwards(run, run.truth)
         track = follow(run.truth)
         found += collisions(run, track)
     else:
@@ -303,6 +308,18 @@ def false_frames(time: np.ndarray, pose: np.ndarray, off_by: tuple[float, float]
     middle = median_filter(pose, (1, 5), mode="nearest")
     off = np.abs(pose - middle)
     return np.any(off > np.array([[limit], [limit], [limit_yaw]]), axis=0)
+
+
+def backwards(run: Run, truth: Table) -> Iterator[LogDefect]:
+    """Stretches of `REVERSED` seconds in which a car that is driven forwards goes backwards."""
+    track = follow(truth)
+    if track is None:
+        return
+    driven = (asked(run, "throttle", track.time) > DRIVEN) & (track.vx < -APART)
+    for first, last in stretches(driven):
+        span = float(track.time[first]), float(track.time[last])
+        if span[1] - span[0] >= REVERSED:
+            yield LogDefect(*span, "heading_rad points backwards while the car is driven forwards")
 
 
 def jumps(truth: Table) -> Iterator[LogDefect]:
@@ -628,6 +645,7 @@ def _refuse_truth(run: Run, truth: Table) -> None:
     time, pose = frames(truth)
     if len(time) < ROWS:
         return
+    pose[2] = without_turns(pose[2])
     span = np.diff(time)
     # Over a tenth of a second, poses give a course. From frame to frame, they give noise.
     stride = max(1, round(0.1 / float(np.median(span))))
@@ -644,6 +662,14 @@ def _refuse_truth(run: Run, truth: Table) -> None:
     course = np.arctan2(north, east)
     bend = np.angle(np.exp(1j * (course[stride:] - course[:-stride])))
     curved = moving[stride:] & moving[:-stride] & (np.abs(bend) > 0.05)
+    _refuse_axes(run, file, begins + over / 2, pose[2, : len(course)] + turned / 2, course, moving)
+    found = _ratio(turned[stride:], bend, curved)
+    if found and found[0] > -MIRRORED and found[1] < -1 / MIRRORED:
+        at = float(begins[stride:][np.argmax(curved)])
+        raise InputError(
+            f"{file}, {at:.2f} s: heading_rad turns against the course of x_m, y_m: y is to the "
+            "left of x, and headings are positive to the left"
+        )
     _refuse_degrees(file, "heading_rad", begins[stride:], turned[stride:], bend, curved)
     rate = np.abs(turned) / over
     if np.quantile(rate, 0.9) > FASTEST_YAW:  # for a spinning car: it has no reliable course
@@ -659,6 +685,36 @@ def _refuse_truth(run: Run, truth: Table) -> None:
         size = np.hypot(truth["vx_mps"], truth["vy_mps"])
         size = np.interp(middle, truth["time_s"], size)
         _refuse_other_units(file, "vx_mps, vy_mps", begins, size, speed, speed > 2 * STANDS)
+
+
+def without_turns(heading: np.ndarray) -> np.ndarray:
+    """The heading without jumps of whole turns, as a quaternion's sign makes them."""
+    jump = np.diff(heading)
+    whole = 2 * math.pi * np.rint(jump / (2 * math.pi))
+    jump = np.where(np.abs(jump - whole) < TURN_WITHIN, whole, 0.0)
+    return heading - np.append(0.0, np.cumsum(jump))
+
+
+def _refuse_axes(
+    run: Run,
+    file: str,
+    time: np.ndarray,
+    heading: np.ndarray,
+    course: np.ndarray,
+    moving: np.ndarray,
+) -> None:
+    """Refuse a heading that is not that of the course while the car is driven forwards."""
+    driven = moving & (asked(run, "throttle", time) > DRIVEN)
+    if np.sum(driven) < TELLING:
+        return
+    mean = np.mean(np.exp(1j * (course - heading)[driven]))
+    off = float(np.angle(mean))
+    if abs(mean) > ALIGNED and abs(off) > SIDEWAYS:
+        raise InputError(
+            f"{file}, {time[np.argmax(driven)]:.2f} s: heading_rad is off the course of x_m, y_m "
+            f"by {math.degrees(off):.0f}°, though the car is driven forwards: it is 0 along x, and "
+            "positive to the left"
+        )
 
 
 def _refuse_sensors(run: Run) -> None:

@@ -94,7 +94,7 @@ class Estimate(NamedTuple):
 
     kind: Kind
     declared: float
-    source: str  # of the declared one: run.toml, the car, or the run's convention
+    source: str  # of the declared one: run.toml, the car, or truth.csv by what the file means
     value: float  # estimated
     deviation: float
     used: str  # declared, estimated
@@ -184,7 +184,7 @@ def warning(one: Estimate) -> str:
     kind = one.kind
     plus = "" if one.deviation == 0 else f" ± {one.deviation:.2g}"
     line = (
-        f"{kind.what}: the log tells {one.value:.4g}{plus}, {one.source} {one.declared:.4g} "
+        f"{kind.what}: the log tells {one.value:.4g}{plus}, but {one.source} {one.declared:.4g} "
         f"({kind.key} under [sensors.{kind.sensor}] of run.toml)"
     )
     return f"{line}; the log's is used" if one.used == "estimated" else line
@@ -272,6 +272,7 @@ class Solved(NamedTuple):
     value: np.ndarray  # (coefficients + 1,), the lag last
     deviation: np.ndarray
     spread: float  # robust standard deviation of the residuals
+    misfit: float = 0.0  # root mean square of all residuals, of outliers too
 
 
 def regression(
@@ -288,6 +289,7 @@ def regression(
     """
     designs = [design(lag) for lag in lags.tolist()]
     usable = np.isfinite(target) & np.all([np.isfinite(d).all(axis=1) for d in designs], axis=0)
+    known = usable.copy()
     for _ in range(3):
         if np.sum(usable) < FEWEST:
             return None
@@ -296,7 +298,7 @@ def regression(
         best = int(np.argmin(np.abs(lags - found.value[-1])))
         off = np.abs(target - designs[best] @ found.value[:-1])
         usable &= ~(off > OUTLYING * max(found.spread, FINEST))
-    return found
+    return found._replace(misfit=float(np.sqrt(np.mean(off[known] ** 2))))
 
 
 def _solved(
@@ -423,7 +425,7 @@ def capture_point(run: Run, car: Car, course: Course) -> list[Estimate]:
     found = regression(lambda _: design, target, course.time, np.zeros(1), prior)
     if found is None:
         return []
-    convention = (0.0, "its place in the file's truth.csv")
+    convention = (0.0, "truth.csv")
     own = sensor_tables(run.about, "capture")
     yaw, forward = (float(v) for v in found.value[:2])
     # The table was moved by what is declared. The estimate is what is left.
@@ -511,7 +513,7 @@ def encoder_lag(run: Run, car: Car, measured: Measured, course: Course) -> list[
         return []
     declared = (measured.encoder_timing.lag, "the car")
     y = aside / scale + sensor_tables(run.about, "capture").get("y_m", 0.0)
-    convention = (0.0, "its place in the file's truth.csv")
+    convention = (0.0, "truth.csv")
     return [
         estimated(run, "encoder", "lag_s", declared, lag, float(found.deviation[3])),
         estimated(run, "capture", "y_m", convention, y, float(found.deviation[1]) / scale),
@@ -541,7 +543,8 @@ def gyro_lag(run: Run, gyro: Signal, course: Course) -> list[Estimate]:
 # -------------------------------------------------------------------------------------------------
 
 OTHER_WHEEL = 0.7  # residual of the best wheel over that of the declared one, for a warning
-BESIDE = 0.01  # m, prior deviation of the captured point to the left where wheels are compared
+AS_GOOD = 1.1  # residual over the least, of wheels that cannot be told apart
+BESIDE = 0.002  # m, prior deviation of the captured point to the left where wheels are compared
 
 
 def noise_warning(run: Run) -> list[str]:
@@ -560,18 +563,19 @@ def noise_warning(run: Run) -> list[str]:
 def wheel_warning(run: Run, car: Car, measured: Measured, course: Course) -> list[str]:
     """A line if the encoder seems to sit on another wheel than declared."""
     declared = windows.encoder_on(run, car)
-    spread = {}
+    misfit = {}
     for on in ENCODER_ON:
         fit = encoder_fit(car, measured, course, windows.shares(on, car), BESIDE)
         if fit is not None:
-            spread[on] = fit.spread
-    if declared not in spread:
+            misfit[on] = fit.misfit
+    if declared not in misfit:
         return []
-    best = min(spread, key=lambda on: spread[on])
-    if spread[best] > OTHER_WHEEL * spread[declared]:
+    least = min(misfit.values())
+    if least > OTHER_WHEEL * misfit[declared]:
         return []
+    likely = [on for on, off in misfit.items() if off < AS_GOOD * least]
     return [
-        f"the encoder reads as one on the {best} would (off by {spread[best]:.3f} m/s), not as one "
-        f'on the {declared} ({spread[declared]:.3f} m/s): write on = "{best}" under '
+        f"the encoder reads as one on the {' or '.join(likely)} would (off by {least:.3f} m/s), "
+        f"not as one on the {declared} ({misfit[declared]:.3f} m/s): change on under "
         "[sensors.encoder] of run.toml, unless the captured point is beside the middle"
     ]

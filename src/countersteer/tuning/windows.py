@@ -173,11 +173,11 @@ def encoder_timing(run: Run, car: Car) -> Timing:
     The car is the run's own, or else `car`. Its encoder counts regions over its update time. So a
     reading lags by half of it.
     """
-    declared = sensor_tables(run.about, "encoder")
     part = (run.car or car).sensors.encoder
-    over = float(declared.get("over_s", part.update))
+    of_car = {"over_s": part.update, "regions": part.regions}
+    declared = of_car | sensor_tables(run.about, "encoder")
+    over, regions = float(declared["over_s"]), float(declared["regions"])
     tire = car.tires.rear if "rear" in encoder_on(run, car) else car.tires.front
-    regions = float(declared.get("regions", part.regions))
     step = math.pi * float(tire.radius) / regions / over if over else 0.0
     return Timing(declared.get("lag_s", over / 2), over, declared.get("step_mps", step))
 
