@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from countersteer.car.car import Car
+from countersteer.car.files import require_speed_controller
 from countersteer.course.course import Course
 from countersteer.drivers import DRIVERS, own, plan, policy, ppo
 from countersteer.drivers.drift_turn import drift_turn
@@ -40,7 +41,10 @@ def make_driver(
     if name.endswith(".csv"):
         if speed is not None:
             raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
-        return replay(read(Path(name))), {"kind": "replay"}
+        commands = read(Path(name))
+        if "speed" in commands:
+            require_speed_controller(car, name)
+        return replay(commands), {"kind": "replay"}
     tables: dict[str, Any] = {} if speed is None else {"speed_mps": speed}
     # Looking for what is installed takes longer than making a driver of the library.
     theirs = name not in DRIVERS and not name.endswith(".toml") and name in own.installed()

@@ -1,7 +1,7 @@
 """`Run`: the record of one drive, read from its folder."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,7 @@ from countersteer.car.files import car_from_tables, library, load_car
 from countersteer.errors import InputError
 from countersteer.reading.content import read_text, reading
 from countersteer.reading.documents import json_object, toml
-from countersteer.runs.files import (
-    LONGEST,
-    Table,
-    drive_column,
-    read_commands,
-    read_measurements,
-)
+from countersteer.runs.files import LONGEST, Table, read_commands, read_measurements
 from countersteer.runs.keys import check_about, check_summary
 from countersteer.text import checked_format
 
@@ -67,15 +61,6 @@ def drawn_car(about: Mapping[str, Any]) -> Car:
         return car_from_tables(about["car"], "run.toml")
     name = about.get("car_name")
     return load_car(name if name in library() else "rx7")
-
-
-def refuse_uncontrolled(commands: Iterable[str], car: Car, where: str) -> None:
-    """Raise `InputError` for commands in m/s to a car without a speed controller."""
-    if drive_column(commands) == "speed" and not car.speed_controller.gain:
-        raise InputError(
-            f"{where}: is commanded in m/s (speed_mps), and the car has no speed controller: give "
-            "a car whose speed_controller.gain_spm is above 0"
-        )
 
 
 def refuse_long(run: Run) -> None:
