@@ -13,10 +13,15 @@ from countersteer import cli
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
 from countersteer.car.parameter import changed
+from countersteer.course.files import load_course
+from countersteer.drivers.registry import make_driver
 from countersteer.errors import InputError
+from countersteer.link.link import RADIO
+from countersteer.pilot import Pilot
 from countersteer.runs.files import read_commands
 from countersteer.runs.run import Run, read_run
 from countersteer.signals import AnyCommand, Command, SpeedCommand
+from countersteer.simulator import Simulator, begin, tick
 from countersteer.tuning import fit, shooting
 from countersteer.tuning.compare import compare
 from countersteer.world import plant, speed_controller
@@ -152,6 +157,24 @@ def test_the_case_of_a_car_commanded_in_metres_a_second(tmp_path, capsys):
     assert run.commands["speed"][0] == 1.478
     assert run.truth["vx_mps"][-1] > 0.9
     assert "Commanded speed" in (Path(out) / "report.html").read_text()
+
+
+def test_a_course_is_driven_by_commanded_speeds_on_board_and_not_over_a_radio(tmp_path):
+    file = tmp_path / "commands.csv"
+    file.write_text("time_s,speed_mps,steering_deg\n0,1.0,0\n")
+    course, car = load_course("box"), controlled()
+    driver, _ = make_driver(str(file), course, car, None, 1, read_commands)
+    pilot, simulator = Pilot.of(driver, course, car), Simulator.of(course, car)
+    # Traced only, as compiling it takes long: its filter follows the controller too.
+    with jax.enable_x64(True):
+        loop = jax.eval_shape(lambda: begin(simulator))
+        memory = jax.eval_shape(lambda: pilot.init(simulator.root))
+        after = jax.eval_shape(lambda *state: tick(simulator, pilot, *state), loop, memory)
+    assert isinstance(after[2].command, SpeedCommand)
+    with pytest.raises(InputError, match="radio sends throttles"):
+        Pilot.of(driver, course, car, link=RADIO)
+    with pytest.raises(InputError, match="no speed controller"):
+        make_driver(str(file), course, load_car("rx7"), None, 1, read_commands)
 
 
 # -------------------------------------------------------------------------------------------------

@@ -83,7 +83,12 @@ class Pilot:
     def with_estimator(
         cls, driver: Driver, estimator: Estimator, link: Link = ONBOARD, dt: float = 0.001
     ) -> "Pilot":
-        """With your own estimator. Decisions come at the link's pace, or slower by the driver's."""
+        """With your own estimator. Decisions come at the link's pace, or slower by the driver's.
+
+        Raises `InputError` for a driver that commands speeds over a radio, which sends throttles.
+        """
+        if not link.onboard and getattr(driver, "command_type", Command) is SpeedCommand:
+            raise InputError(f"the {link.name} sends throttles, and the commands are in m/s")
         period = link.control_period
         if not traceable(driver):
             period = max(period, float(getattr(driver, "period", PYTHON_PERIOD)))

@@ -19,13 +19,11 @@ from countersteer.course.course import Course
 from countersteer.course.files import course_tables
 from countersteer.drivers.driver import ROUNDING, Observation, Status, status_of
 from countersteer.drivers.registry import make_driver
-from countersteer.drivers.replay import SpeedReplay
 from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
 from countersteer.pilot import Pilot
 from countersteer.runs.files import COVARIANCE, ESTIMATE, ROLLOUTS, read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
-from countersteer.runs.run import refuse_uncontrolled
 from countersteer.sensing.all_sensors import channels
 from countersteer.sensing.faults import SensorFault, fault_tables
 from countersteer.signals import Command, Motion, Wheels, truth_columns
@@ -72,8 +70,6 @@ def prepare(
     course.check_laps(laps)
     nominal = load_car(car_name)
     made, tables = make_driver(driver, course, nominal, speed, laps, read_commands)
-    if isinstance(made, SpeedReplay):
-        refuse_uncontrolled(("speed",), car, driver)
     pilot = Pilot.of(made, course, nominal, estimate, link, dt)
     simulator = Simulator.of(
         course,

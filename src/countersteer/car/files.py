@@ -72,6 +72,15 @@ def check(car: Car, where: str) -> None:
         raise InputError(f"{where}: motor.dead_zone must be less than motor.full_throttle")
 
 
+def require_speed_controller(car: Car, where: str) -> None:
+    """Raise `InputError`, naming the commands in m/s, if a car cannot follow them."""
+    if not car.speed_controller.gain:
+        raise InputError(
+            f"{where}: is commanded in m/s (speed_mps), and the car has no speed controller: give "
+            "a car whose speed_controller.gain_spm is above 0"
+        )
+
+
 def _load(name: str, seen: tuple[Path, ...]) -> Car:
     """A car with its bases. `seen` holds the files on the way to it, to reject a cycle."""
     tables, where = read_toml(name, LIBRARY, "car")

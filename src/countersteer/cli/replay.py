@@ -75,19 +75,19 @@ def run(options: argparse.Namespace) -> int:
 
 def replayed(options: argparse.Namespace, run: "Run | None", car: "Car", name: str) -> "Drive":
     """The drive that replays a run's commands, or those of a `commands.csv`."""
+    from countersteer.car.files import require_speed_controller
     from countersteer.course.files import course_of_run
     from countersteer.drivers.registry import replay
     from countersteer.estimation.dead_reckoning import DeadReckoning
     from countersteer.pilot import Pilot
     from countersteer.recorded_drive import Drive, about_run
     from countersteer.runs.files import LONGEST, read_commands
-    from countersteer.runs.run import refuse_uncontrolled
     from countersteer.simulator import Simulator
     from countersteer.world.floor import floor_of_run
 
     commands = run.commands if run else read_commands(options.source)
-    where = f"{options.source}/commands.csv" if run else str(options.source)
-    refuse_uncontrolled(commands, car, where)
+    if "speed" in commands:
+        require_speed_controller(car, str(options.source))
     pose, velocity = read_initial(options.initial)
     if run is not None and not options.initial:
         begin = run.about.get("start") or run.about.get("course", {}).get("start")

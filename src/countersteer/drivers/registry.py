@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from countersteer.car.car import Car
+from countersteer.car.files import require_speed_controller
 from countersteer.course.course import Course
 from countersteer.drivers import DRIVERS, optimum, own, plan, policy, ppo, stored, tabular
 from countersteer.drivers.drift_turn import drift_turn
@@ -43,7 +44,10 @@ def make_driver(
         if speed is not None:
             raise InputError(f"--speed-mps: {name} holds commands, and is asked for no speed")
         file = Path(name) if name != "optimum" else optimum.commands_for(course, car, laps)
-        return replay(read(file)), {"kind": "replay"}
+        commands = read(file)
+        if "speed" in commands:
+            require_speed_controller(car, name)
+        return replay(commands), {"kind": "replay"}
     tables: dict[str, Any] = {} if speed is None else {"speed_mps": speed}
     # Looking for what is installed takes longer than making a driver of the library.
     theirs = name not in DRIVERS and not name.endswith(".toml") and name in own.installed()

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from countersteer.car.car import GRAVITY, Car
-from countersteer.signals import Command, Scalar
-from countersteer.world import drivetrain, motor, servo, tyre
+from countersteer.signals import AnyCommand, Scalar, Wheels
+from countersteer.world import drivetrain, motor, servo, speed_controller, tyre
 from countersteer.world.angle import cosine_sine
 from countersteer.world.chassis import Symmetric, Vector, combine, dot, solve
 from countersteer.world.planar import rotated
@@ -20,9 +20,13 @@ class Actuators(NamedTuple):
     steering: Scalar  # rad
 
 
-def follow(car: Car, before: Actuators, command: Command, h: Scalar) -> Actuators:
-    """The state after h seconds of a command. A pure delay counts as additional lag."""
-    goal = motor.duty(car.motor, command.throttle)
+def follow(car: Car, before: Actuators, command: AnyCommand, speed: Scalar, h: Scalar) -> Actuators:
+    """The state after h seconds of a command. A pure delay counts as additional lag.
+
+    A speed controller measures `speed` (m/s).
+    """
+    front, rear = speed / car.tires.front.radius, speed / car.tires.rear.radius
+    goal = speed_controller.goal_duty(car, command, Wheels(front, front, rear, rear))
     slow = dataclasses.replace(car.servo, lag=car.servo.lag + car.servo.delay)
     return Actuators(
         before.duty - (goal - before.duty) * jnp.expm1(-h / (car.motor.lag + car.motor.delay)),

@@ -315,7 +315,7 @@ def backwards(run: Run, truth: Table) -> Iterator[LogDefect]:
     track = follow(truth)
     if track is None:
         return
-    driven = (asked(run, "throttle", track.time) > DRIVEN) & (track.vx < -APART)
+    driven = (asked(run, drive_column(run.commands), track.time) > DRIVEN) & (track.vx < -APART)
     for first, last in stretches(driven):
         span = float(track.time[first]), float(track.time[last])
         if span[1] - span[0] >= REVERSED:
@@ -704,7 +704,7 @@ def _refuse_axes(
     moving: np.ndarray,
 ) -> None:
     """Refuse a heading that is not that of the course while the car is driven forwards."""
-    driven = moving & (asked(run, "throttle", time) > DRIVEN)
+    driven = moving & (asked(run, drive_column(run.commands), time) > DRIVEN)
     if np.sum(driven) < TELLING:
         return
     mean = np.mean(np.exp(1j * (course - heading)[driven]))

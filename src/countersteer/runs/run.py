@@ -1,7 +1,7 @@
 """`Run`: the record of one drive, read from its folder."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from countersteer.runs.files import (
     ROLLOUTS,
     SLOWEST_CLOCK,
     Table,
-    drive_column,
     read_commands,
     read_measurements,
 )
@@ -73,15 +72,6 @@ def drawn_car(about: Mapping[str, Any]) -> Car:
         return car_from_tables(about["car"], "run.toml")
     name = about.get("car_name")
     return load_car(name if name in library() else "rx7")
-
-
-def refuse_uncontrolled(commands: Iterable[str], car: Car, where: str) -> None:
-    """Raise `InputError` for commands in m/s to a car without a speed controller."""
-    if drive_column(commands) == "speed" and not car.speed_controller.gain:
-        raise InputError(
-            f"{where}: is commanded in m/s (speed_mps), and the car has no speed controller: give "
-            "a car whose speed_controller.gain_spm is above 0"
-        )
 
 
 def refuse_long(run: Run) -> None:

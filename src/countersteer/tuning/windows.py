@@ -15,12 +15,13 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from countersteer.car.car import Car
+from countersteer.car.files import require_speed_controller
 from countersteer.errors import InputError
 from countersteer.runs.declared import sensor_tables
 from countersteer.runs.defects import stretches
 from countersteer.runs.files import Table, drive_column
 from countersteer.runs.keys import ENCODER_ON
-from countersteer.runs.run import Run, refuse_long, refuse_uncontrolled
+from countersteer.runs.run import Run, refuse_long
 from countersteer.signals import AnyCommand, Command, Motion, Scalar, SpeedCommand, Wheels
 from countersteer.world import planar, servo, speed_controller
 from countersteer.world.chassis import Vector, dot
@@ -112,7 +113,8 @@ def read_measured(run: Run, car: Car) -> Measured:
     commanded in m/s and the car has no speed controller.
     """
     refuse_long(run)
-    refuse_uncontrolled(run.commands, car, f"{run.path}/commands.csv")
+    if "speed" in run.commands:
+        require_speed_controller(car, f"{run.path}/commands.csv")
     vx = vy = yaw_rate = wheels = None
     truth = run.truth
     if truth is not None and len(truth):

@@ -90,7 +90,7 @@ def follow_track(
     h: Scalar,
 ) -> Track:
     """The single track, h seconds later; between readings the accelerometer's last one is held."""
-    actuators = single_track.follow(car, memory.actuators, command, h)
+    actuators = single_track.follow(car, memory.actuators, command, memory.ahead.x, h)
     behind = car.body.wheelbase - car.body.front_axle
     slip_speed = memory.ahead.y - behind * memory.ahead.yaw
     slip = jnp.abs(slip_speed) / (jnp.abs(memory.ahead.x) + 0.3)

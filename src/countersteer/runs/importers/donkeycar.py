@@ -33,14 +33,15 @@ def import_donkeycar(log: Path, out: Path, mapping: Path | None) -> dict[str, An
     recipe = read_mapping(mapping, "donkeycar")
     tub = log.parent if log.name == MANIFEST else log
     with reading(tub):
-        table = RecordTable(str(tub), _columns(tub))
+        table = _table(tub, recipe.columns | {INDEX, TIME})
     return import_mapped(tub, out, "donkeycar", recipe, lambda name: None if name else table)
 
 
-def _columns(tub: Path) -> dict[str, list[Any]]:
-    """The values of all records by key, without deleted ones, in the order of their indexes."""
+def _table(tub: Path, wanted: set[str]) -> RecordTable:
+    """The wanted values of all records but the deleted ones, in the order of time."""
     paths, deleted = _catalogs(tub)
-    records = []
+    records: list[dict[str, Any]] = []
+    names: dict[str, None] = {}
     for path in paths:
         for number, line in enumerate(read_text(tub / path).splitlines(), start=1):
             if not line.strip("\0 "):
@@ -49,19 +50,17 @@ def _columns(tub: Path) -> dict[str, list[Any]]:
             record = json_object(line, where)
             values.number(record.get(TIME), f"{where}: {TIME}", 0, 1e15)
             index = values.whole(record.get(INDEX), f"{where}: {INDEX}", 0, 10**12)
-            if len(record) > MOST_KEYS:
-                raise InputError(f"{where}: {len(record)} keys, over {MOST_KEYS}")
+            names |= dict.fromkeys(record)
+            if len(names) > MOST_KEYS:
+                raise InputError(f"{where}: {len(names)} keys, over {MOST_KEYS}")
             if index not in deleted:
-                records.append(record)
+                records.append({key: record[key] for key in wanted & record.keys()})
             if len(records) > MOST_RECORDS:
                 raise InputError(f"{tub}: over {MOST_RECORDS} records: cut it into pieces")
     if not records:
         raise InputError(f"{tub}: holds no records")
     records.sort(key=lambda record: record[TIME])
-    names = dict.fromkeys(key for record in records for key in record)
-    if len(names) > MOST_KEYS:
-        raise InputError(f"{tub}: {len(names)} keys, over {MOST_KEYS}")
-    return {name: [record.get(name) for record in records] for name in names}
+    return RecordTable(str(tub), records, names)
 
 
 def _catalogs(tub: Path) -> tuple[list[str], set[int]]:

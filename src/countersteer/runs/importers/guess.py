@@ -14,6 +14,7 @@ import numpy as np
 
 from countersteer.errors import InputError
 from countersteer.reading.values import short
+from countersteer.runs.importers.mapping import LONGEST
 from countersteer.runs.importers.tables import TextTable
 from countersteer.runs.importers.units import SIGNALS, UNITS
 
@@ -109,7 +110,8 @@ def guess_mapping(log: Path) -> tuple[str, list[str]]:
     Raises `InputError` if no column looks like a time, a throttle or a commanded speed.
     """
     table = TextTable(log)
-    columns = [_column(table, name) for name in dict.fromkeys(table.names)]
+    names = [name for name in dict.fromkeys(table.names) if len(name) <= LONGEST]
+    columns = [_column(table, name) for name in names]
     guesses: dict[str, Guess] = {}
     taken: set[str] = set()
     for signal, (words, against) in WORDS.items():

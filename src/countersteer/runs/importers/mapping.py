@@ -79,6 +79,11 @@ class Recipe:
     point: tuple[float, float, float]  # captured point from the centre of mass, m, and yaw error
     about: dict[str, Any]  # goes to `run.toml`
 
+    @property
+    def columns(self) -> set[str]:
+        """All columns that it names."""
+        return {name for entries in self.entries.values() for e in entries for name in e.columns}
+
 
 def read_mapping(path: Path | None, built_in: str | None = None) -> Recipe:
     """A mapping from a file, laid over that of a format, if it has one.

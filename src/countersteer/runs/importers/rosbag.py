@@ -112,7 +112,6 @@ def opened(log: Path) -> Iterator[Any]:
 
 def tables_of(bag: Any, log: Path, recipe: Recipe) -> Find:
     """The tables of a bag: the messages of a topic, as far as the mapping names their columns."""
-    wanted = {name for entries in recipe.entries.values() for e in entries for name in e.columns}
     tables: dict[str, RecordTable | None] = {}
 
     def find(name: str) -> RecordTable | None:
@@ -125,7 +124,7 @@ def tables_of(bag: Any, log: Path, recipe: Recipe) -> Find:
                     f"{log}: {len(topics)} topics are {shown(name)}: name one in a mapping's "
                     f"'from': {known}"
                 )
-            tables[name] = _table(bag, log, connections, wanted) if connections else None
+            tables[name] = _table(bag, log, connections, recipe.columns) if connections else None
         return tables[name]
 
     return find
@@ -153,8 +152,7 @@ def _table(bag: Any, log: Path, connections: list[Any], wanted: set[str]) -> Rec
             raise InputError(f"{log}: {short(topic)}: over {MOST_MESSAGES} messages: cut the bag")
     if not records:
         raise InputError(f"{log}: {short(topic)}: holds no messages")
-    columns = {n: [record.get(n) for record in records] for n in (BAG_TIME, *names)}
-    return RecordTable(f"{log}, {short(topic)}", columns)
+    return RecordTable(f"{log}, {short(topic)}", records, (BAG_TIME, *names))
 
 
 def _types(log: Path, connection: Any) -> Types:

@@ -5,7 +5,7 @@ Our own tables are read strictly, by `runs.files`.
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,10 @@ class TextTable:
         """Read it. Raises `InputError` if it has no rows, or its rows differ in length."""
         self.path = path
         with reading(path):
-            lines = [line for line in read_text(path).splitlines() if line.strip()]
+            content = read_text(path)
+            if content.count("\n") > MOST_CELLS:
+                raise InputError(f"{path}: over {MOST_CELLS} lines: cut the log into pieces")
+            lines = [line for line in content.splitlines() if line.strip()]
             if not lines:
                 raise InputError(f"{path}: is empty")
             # The header is the first line that is no comment, or a comment before numbers.
@@ -111,9 +114,14 @@ class TextTable:
 class RecordTable:
     """The columns of records that were read one by one, such as messages."""
 
-    def __init__(self, where: str, columns: dict[str, list[Any]]) -> None:
-        """`where` names the table in messages. Columns are of one length."""
-        self.where, self.columns, self.names = where, columns, list(columns)
+    def __init__(
+        self, where: str, records: Sequence[Mapping[str, Any]], names: Iterable[str]
+    ) -> None:
+        """`where` names the table in messages. `names` has all columns that the log holds.
+
+        The records hold those that are asked for.
+        """
+        self.where, self.records, self.names = where, records, list(names)
 
     def place(self, row: int) -> str:
         """Where a row stands, for messages."""
@@ -121,16 +129,18 @@ class RecordTable:
 
     def text(self, name: str) -> list[str]:
         """The values of a column as text."""
-        return [str(value) for value in self.columns[name]]
+        return [str(record.get(name)) for record in self.records]
 
     def numbers(self, name: str) -> np.ndarray:
         """The numbers of a column; NaN where a record has none. Raises `InputError`."""
-        found = [math.nan if v is None else as_float(v) for v in self.columns[name]]
-        for row, value in enumerate(self.columns[name]):
+        found = []
+        for row, record in enumerate(self.records):
+            value = record.get(name)
             if not isinstance(value, int | float | None):
                 raise InputError(
                     f"{self.place(row)}: {short(name)} must be a number, not {shown(value)}"
                 )
+            found.append(math.nan if value is None else as_float(value))
         return np.array(found, float)
 
     def times(self, names: Sequence[str]) -> np.ndarray:
