@@ -259,6 +259,22 @@ def test_a_damaged_policy_is_refused_in_one_line(policy, parts, says):
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_with_wrong_bytes_is_refused_in_one_line(policy):
+    whole, rng = policy.read_bytes(), np.random.default_rng(3)
+    messages = []
+    for _ in range(60):
+        part = bytearray(whole)
+        for at in rng.integers(0, len(part), 3):
+            part[at] = rng.integers(256)
+        policy.write_bytes(bytes(part[: rng.integers(1, len(part) + 1)]))
+        try:
+            tabular.read_table(policy)
+        except InputError as error:
+            messages.append(str(error))
+    assert len(messages) > 50
+    assert not any("\n" in message for message in messages)
+
+
 def test_a_file_that_unpacks_to_too_much_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "LARGEST", 100_000)
     path = tmp_path / "bomb.npz"

@@ -1,5 +1,6 @@
 """The margin of a drive: how near its car came to a wall."""
 
+import math
 from typing import Any
 
 import jax
@@ -12,6 +13,8 @@ from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.signals import Array, Motion, Scalar
 from countersteer.world.walls import padded
+
+ROWS = 1024  # of a motion, or a multiple
 
 
 @pytree
@@ -40,8 +43,11 @@ class Margin:
 
     def least(self, body: Body, motion: Motion) -> Scalar:
         """The least margin of a motion with leaves (n,)."""
-        found = jax.jit(jax.vmap(self.clear, (None, 0)))(body, motion)
-        return np.float32(np.min(found))
+        count = len(motion.x)
+        # The last row fills up: drives of any length share a program.
+        rows = np.minimum(np.arange(math.ceil(count / ROWS) * ROWS), count - 1)
+        filled = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[rows], motion)
+        return np.float32(np.min(_clear(self, body, filled)))
 
     def clear(self, body: Body, motion: Motion) -> Scalar:
         """Distance (m) of the car's rectangle to the nearest wall. It counts until they touch.
@@ -70,3 +76,9 @@ class Margin:
                 dx, dy = ax + on * (bx - ax) - cx, ay + on * (by - ay) - cy
                 nearest = jnp.minimum(nearest, jnp.sqrt(dx**2 + dy**2))
         return jnp.min(jnp.where(jnp.isnan(self.walls[:, 0]), jnp.inf, nearest))
+
+
+@jax.jit
+def _clear(margin: Margin, body: Body, motion: Motion) -> Array:
+    """The margin at each row of a motion."""
+    return jax.vmap(margin.clear, (None, 0))(body, motion)

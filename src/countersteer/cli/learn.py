@@ -88,7 +88,8 @@ def grid_options(made: Parser, default: str) -> None:
     made.option("--throttle", "T", throttle, [0.0, 0.5, 1.0], "of the actions", nargs="+")
     angles = [-28.0, -14.0, 0.0, 14.0, 28.0]
     made.option("--steering-deg", "DEG", lock, angles, "of the actions", nargs="+")
-    made.option("--decision-s", "S", number(0.02, 1), 0.12, "for which an action is held")
+    meaning = "for which an action is held, in steps of 0.02"
+    made.option("--decision-s", "S", number(0.02, 0.3), 0.12, meaning)
     made.option("--horizon-s", "S", number(0.2, 1000), 2.0, "rewards so far ahead count 1/e")
     made.option("--margin-m", "M", number(0, 1), 0.03, "from a wall that counts as a touch")
     meaning = "how a term of the reward counts: time, road, goal or progress (repeatable)"
@@ -289,7 +290,7 @@ def tabular_job(
         tabular.dimensions_of(options.dimensions or dimensions, course),
         tuple(options.throttle),
         tuple(map(math.radians, options.steering_deg)),
-        options.decision_s,
+        0.02 * round(options.decision_s / 0.02),
         options.horizon_s,
         weights_of(options.reward, weights, tabular.TERMS),
         options.margin_m,

@@ -10,6 +10,7 @@ import io
 import json
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,11 @@ from countersteer.errors import InputError
 from countersteer.reading.values import short, shown
 
 LARGEST = 100_000_000  # bytes of a file, also once it is unpacked
+# What a damaged file raises: in its folder, its packing, its arrays' heads, its JSON.
+BROKEN = (
+    OSError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error, ValueError,
+    KeyError, TypeError, AttributeError,
+)  # fmt: skip
 
 
 def packed(arrays: Mapping[str, Any], about: Mapping[str, Any]) -> bytes:
@@ -41,7 +47,7 @@ def read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         with np.load(path) as file:
             held = {name: file[name] for name in file.files}
         about = json.loads(held.pop("about").tobytes().decode())
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except BROKEN as error:
         raise InputError(f"{where}: {wrong}: {error}") from None
     if not isinstance(about, dict) or about.get("kind") != kind:
         raise InputError(f"{where}: {wrong}")
@@ -56,7 +62,7 @@ def kind_of(path: Path) -> str:
         with np.load(path) as file:
             about = json.loads(file["about"].tobytes().decode())
         kind = about["kind"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except BROKEN as error:
         raise InputError(f"{where}: is no policy of 'learn': {error}") from None
     return str(kind)
 

@@ -43,7 +43,7 @@ SAMPLES = 2  # poses of a decision that are looked at: at its middle and its end
 class Frame(NamedTuple):
     """How a pose is told in a table: along the course, or in the world's axes."""
 
-    way: Way  # of `frame_way`
+    way: Way  # rounded by `ROUNDING`
 
     def pose(self, at: Mapping[str, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
         """x, y and heading of a grid's point."""
@@ -133,12 +133,12 @@ def driven(
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, zero.dtype) + zero, state)
     duty = motor.duty(car.motor, before.throttle) + zero
     state = state._replace(motion=state.motion._replace(steering=steering + zero, duty=duty))
-    time = STEP * (jnp.arange(round(decision / STEP), dtype=zero.dtype) + 0.5)
+    every = max(1, round(decision / STEP / SAMPLES))
+    time = STEP * (jnp.arange(every * SAMPLES, dtype=zero.dtype) + 0.5)
     commands = Command(
         jnp.where(time < car.motor.delay, before.throttle, action.throttle),
         jnp.where(time < car.servo.delay, before.steering, action.steering),
     )
-    every = round(decision / STEP) // SAMPLES
     _, seen = plant.rollout(car, state, commands, every, STEP, lambda state: state.motion)
     return seen
 

@@ -80,7 +80,7 @@ def draw_slices(
                 vmax=high,
             )
             bar = figure.colorbar(drawn, ax=ax, fraction=0.04, pad=0.02)
-            bar.outline.set_visible(False)  # type: ignore[operator]  # it has one
+            bar.outline.set_visible(False)
             bar.ax.tick_params(length=0, labelsize=LABEL - 1.5, labelcolor=SOFT)
             for ax_, ay, bx, by in walls:
                 ax.plot([ax_, bx], [ay, by], color=WALL, linewidth=2.0, solid_capstyle="round")
