@@ -32,7 +32,7 @@ from countersteer.random_streams import Stream
 from countersteer.sensing import all_sensors, sonar
 from countersteer.sensing import faults as failing
 from countersteer.sensing.faults import SensorFault
-from countersteer.signals import Array, Command, Motion, Readings, Scalar
+from countersteer.signals import AnyCommand, Array, Command, Motion, Readings, Scalar
 from countersteer.world import drivetrain, motor
 from countersteer.world.floor import Floor
 from countersteer.world.planar import planar
@@ -66,7 +66,7 @@ class Record(NamedTuple):
     tick: Scalar
     motion: Motion
     voltage: Scalar  # of the battery under load
-    command: Command
+    command: AnyCommand
     fresh: Scalar  # whether that command is a new one
     readings: Readings
     wall_contacts: Scalar
@@ -163,7 +163,7 @@ class Simulator:
         """The readings that have reached the pilot. `truth` is for the estimator `truth` only."""
         return heard(self, loop)
 
-    def apply(self, loop: Loop, command: Command, ticks: int) -> tuple[Loop, Record]:
+    def apply(self, loop: Loop, command: AnyCommand, ticks: int) -> tuple[Loop, Record]:
         """Advance by `ticks`, with the command given at the first one and held.
 
         The record has a leading axis of ticks. A radio sends commands at its own period.
@@ -229,7 +229,7 @@ def heard(simulator: Simulator, loop: Loop) -> Readings:
 
 
 def advance(
-    simulator: Simulator, loop: Loop, command: Command, fresh: Scalar
+    simulator: Simulator, loop: Loop, command: AnyCommand, fresh: Scalar
 ) -> tuple[Loop, Record]:
     """One tick: command over the link, world, sensors, readings over the link."""
     world, link, root = simulator.world, simulator.link.in_ticks(simulator.dt), simulator.root
@@ -270,7 +270,7 @@ def advance(
     return Loop(after, state, sensors, up, down, faulty), record
 
 
-def _step(world: World, state: Any, command: Command, tick: Scalar) -> Any:
+def _step(world: World, state: Any, command: AnyCommand, tick: Scalar) -> Any:
     """`world.step`, as a loop of one round.
 
     XLA compiles a loop without branches into one function. Beside the branches of the sensors, it
@@ -284,7 +284,9 @@ def _step(world: World, state: Any, command: Command, tick: Scalar) -> Any:
 
 
 @partial(jax.jit, static_argnums=1)
-def _apply(simulator: Simulator, ticks: int, loop: Loop, command: Command) -> tuple[Loop, Record]:
+def _apply(
+    simulator: Simulator, ticks: int, loop: Loop, command: AnyCommand
+) -> tuple[Loop, Record]:
     first = loop.tick
 
     def one(loop: Loop, _: None) -> tuple[Loop, Record]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from countersteer.clock import shared
 from countersteer.estimation.estimate import Estimate
-from countersteer.signals import Command, Scalar
+from countersteer.signals import AnyCommand, Command, Scalar
 
 ROUNDING = 2e-5  # s, rounding error of a time in 32 bits
 THINKS = 0.005  # s between two decisions of a driver; gyroscope and estimate are as frequent
@@ -71,7 +71,7 @@ class Driver(Protocol):
         """The memory at the start of a drive."""
         ...
 
-    def act(self, memory: Any, observation: Observation) -> tuple[Command, Any]:
+    def act(self, memory: Any, observation: Observation) -> tuple[AnyCommand, Any]:
         """The command for the next control period, and the memory after it."""
         ...
 

@@ -7,6 +7,7 @@ motion alone. That is why the table of transitions is small.
 
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -101,7 +102,7 @@ class Grid(NamedTuple):
         mesh = np.meshgrid(*(d.values for d in self.dimensions), indexing="ij")
         return {d.word: m.ravel() for d, m in zip(self.dimensions, mesh, strict=True)}
 
-    def locate(self, values: dict[str, Scalar]) -> tuple[Scalar, list[Scalar]]:
+    def locate(self, values: Mapping[str, Scalar]) -> tuple[Scalar, list[Scalar]]:
         """The lowest corner of the cell around a point, and the part of the cell passed in each.
 
         Dimensions that wrap do; others end at their ranges.

@@ -129,7 +129,8 @@ def driven(
     the delays are over.
     """
     zero = jnp.zeros_like(velocity[0])
-    state = planar.initial_state(car, STEP, (zero, zero, zero), velocity, 1.0, 1)
+    origin: Any = (zero, zero, zero)
+    state: Any = planar.initial_state(car, STEP, origin, velocity, 1.0, 1)
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, zero.dtype) + zero, state)
     duty = motor.duty(car.motor, before.throttle) + zero
     state = state._replace(motion=state.motion._replace(steering=steering + zero, duty=duty))
@@ -206,7 +207,7 @@ class TableDriver:
         action: Command,
     ) -> Scalar:
         """What an action is worth at a state: its reward, and the discounted value behind it."""
-        start = tuple(jnp.asarray(part, jnp.result_type(self.values)) for part in velocity)
+        start: Any = tuple(jnp.asarray(part, jnp.result_type(self.values)) for part in velocity)
         motion = driven(self.car, start, steering, before, action, self.decision)
         end: Motion = jax.tree.map(lambda leaf: leaf[-1], motion)
         at = self.frame.seen(moved(pose, (end.x, end.y, end.heading)), place)

@@ -87,7 +87,8 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self._keys, self._tick = jax.random.key_data(keys), 0
         # What a car is stays; how it moves goes in and out of each step, as one array.
         self._own, own_of = engine.packed(own)
-        self._state, lane_of = engine.packed(state._replace(own=()))
+        nothing: Any = ()
+        self._state, lane_of = engine.packed(state._replace(own=nothing))
         if slots != self._slots:
             stepped = functools.partial(_step, own_of, lane_of)
             self._step = engine.in_one_program(stepped, lanes=self._block, cores=self._cores)
@@ -129,6 +130,7 @@ def _step(
 
     Returns the packed lanes, and what is told of each (`PARTS`).
     """
+    apart: Any = ()  # what a car is does not change
 
     def one(car: Array, state: Array, key: Array, action: Array, done: Scalar) -> Any:
         lane = lane_of(state)._replace(own=own_of(car))
@@ -139,7 +141,7 @@ def _step(
         paid = (1 - done) * jnp.stack(terms)
         rest = jnp.stack([(1 - done) * ended, after.score.time, after.score.outcome])
         told = jnp.concatenate([environment.observe(after), paid, rest])
-        return after._replace(own=()), told
+        return after._replace(own=apart), told
 
     lanes, told = jax.vmap(one)(*own)
     return engine.packed(lanes)[0], told

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from countersteer.car.parameter import pytree
 from countersteer.estimation.estimate import Estimate
-from countersteer.signals import Command, Motion, Readings, Scalar
+from countersteer.signals import AnyCommand, Motion, Readings, Scalar
 
 
 class Estimator(Protocol):
@@ -29,7 +29,7 @@ class Estimator(Protocol):
         """The memory at the start of a drive. `key` is for this estimator alone."""
         ...
 
-    def update(self, memory: Any, readings: Readings, command: Command, tick: Scalar) -> Any:
+    def update(self, memory: Any, readings: Readings, command: AnyCommand, tick: Scalar) -> Any:
         """The memory at `tick`; `command` is what the driver asked for since the update before."""
         ...
 
@@ -55,7 +55,7 @@ class Truth:
         return Estimate(x, y, heading, zero, zero, zero)
 
     def update(
-        self, memory: Estimate, readings: Readings, command: Command, tick: Scalar
+        self, memory: Estimate, readings: Readings, command: AnyCommand, tick: Scalar
     ) -> Estimate:
         """The true state, without a covariance. Raises `ValueError` without ground truth."""
         del memory, command, tick

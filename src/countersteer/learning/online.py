@@ -200,8 +200,9 @@ class Online:
     def _cell(self, going: Going) -> tuple[Scalar, Scalar]:
         """The cell (motion, pose) around a car: its nearest point."""
         zero = jnp.zeros_like(going.place)
-        parts: list[Any] = [*going.pose, *going.velocity, *[zero] * 4]
-        m = Motion(*parts[:6], (zero,) * 4, going.steering, zero, zero, zero, zero)
+        wheels: Any = (zero,) * 4
+        parts: list[Any] = [*going.pose, *going.velocity, wheels, going.steering, *[zero] * 4]
+        m = Motion(*parts)
         seen = in_frame(self.job.table.pose, self.frame.seen(going.pose, going.place))
         return nearest(self.job.table.motion, motion_seen(m)), nearest(self.job.table.pose, seen)
 

@@ -212,7 +212,8 @@ def touching(job: Job, frame: Frame) -> Touching:
     cosine, sine = np.cos(heading)[:, None], np.sin(heading)[:, None]
     ring = np.stack([x[:, None] + cosine * ahead - sine * left,
                      y[:, None] + sine * ahead + cosine * left], axis=-1)  # fmt: skip
-    walls: Any = shapely.multilinestrings(shapely.linestrings(job.course.walls.reshape(-1, 2, 2)))
+    pieces: Any = shapely.linestrings(job.course.walls.reshape(-1, 2, 2))
+    walls: Any = shapely.multilinestrings(pieces)
     walls = shapely.buffer(walls, job.margin) if job.margin > 0 else walls
     shapely.prepare(walls)
     away = jax.tree.map(jnp.asarray, clearance_of(job.course, frame.way))
@@ -376,8 +377,7 @@ class Solver:
                 values = self._hold(values, best, self.table)
             values.block_until_ready()
             spent += time.process_time() - begun
-        values, best = (np.asarray(part)[: self.count] for part in (values, best))
-        return Solution(values, best, curve)
+        return Solution(np.asarray(values)[: self.count], np.asarray(best)[: self.count], curve)
 
     def _step(self, base: Array, gone: Array, value: Array) -> Array:
         """The value of a decision."""

@@ -176,8 +176,8 @@ def _captured(table: Table) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     repeated[1:] = np.all(np.diff(pose) == 0, axis=0) | (np.diff(time) == 0)
     possible = _possible(time, x, y, yaw, ~repeated)
     heading = np.unwrap(yaw[possible])
-    pose = at_centre(x[possible], y[possible], heading, (POINT_X, POINT_Y, YAW_ERROR))
-    truth = dict(zip(("time_s", "x_m", "y_m", "heading_rad"), (time[possible], *pose), strict=True))
+    at = at_centre(x[possible], y[possible], heading, (POINT_X, POINT_Y, YAW_ERROR))
+    truth = dict(zip(("time_s", "x_m", "y_m", "heading_rad"), (time[possible], *at), strict=True))
     wraps = np.sum(np.abs(np.diff(yaw[possible])) > math.pi)
     return truth, {
         "frames_repeated": int(np.sum(repeated)),
