@@ -6,13 +6,13 @@ from typing import Protocol
 
 import numpy as np
 
-from countersteer.viewing.style import INK, LABEL, SOFT, new_figure
+from countersteer.viewing.style import INK, LABEL, SLIP_COLOURS, SOFT, light, new_figure
 from countersteer.writing import naming
 
-VALUES = ("#1b2229", "#0069a8", "#e39a2b", "#fffefb")  # from little to much
-SIDES = ("#0069a8", "#e2ded3", "#c4400f")  # steering to the right, straight on, to the left
-THROTTLES = ("#e2ded3", "#e39a2b", "#a3210f")
-WALL = "#39434c"
+VALUES = (light("ink"), light("velocity"), light("slip-mid"), light("card"))  # from little to much
+SIDES = (light("steered"), light("track"), light("simulated"))  # steering right, straight, left
+THROTTLES = (light("track"), *SLIP_COLOURS[1:])
+WALL = light("wall")
 HEAD = 0.85  # inches, above the slices
 
 
