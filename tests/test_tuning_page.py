@@ -350,7 +350,8 @@ def test_a_trim_near_zero_is_no_reason_for_another_log():
 def declared(part=None, path=""):
     part = Car() if part is None else part
     names = [path + name for name, _ in declarations(type(part)).values()]
-    for name in ("body", "tires", "drivetrain", "motor", "servo", "front", "rear"):
+    parts = ("body", "tires", "drivetrain", "motor", "speed_controller", "servo", "front", "rear")
+    for name in parts:
         if hasattr(part, name) and hasattr(type(part), "__dataclass_fields__"):
             names += declared(getattr(part, name), f"{path}{name}.")
     return names
