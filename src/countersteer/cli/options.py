@@ -50,8 +50,8 @@ class Parser(argparse.ArgumentParser):
         self, name: str, metavar: str | None, kind: Any, default: Any, meaning: str, **more: Any
     ) -> None:
         """An option that takes a value. Its help says the default, where there is one."""
-        shown = default not in (None, [])
-        text = f"{meaning} (default %(default)s)" if shown else meaning
+        shown = " ".join(default) if isinstance(default, list) else default
+        text = meaning if shown in (None, "") else f"{meaning} (default {shown})"
         self.add_argument(
             name, metavar=metavar, type=kind, default=default, help=text.lstrip(), **more
         )
@@ -189,9 +189,11 @@ def laps_and_link(made: Parser, estimates: bool = False) -> None:
         "particle filter of the pose (slower), all from the sensors; or the truth"
     )
     more: dict[str, Any] = {"choices": ("filter", "pose", "reckoning", "truth")}
+    default: Any = "filter"
     if estimates:
-        more, meaning = more | {"nargs": "+"}, f"{meaning}; several give a row each"
-    made.option("--estimate", None, str, "filter", meaning, **more)
+        default, more = [default], more | {"nargs": "+"}
+        meaning = f"{meaning}; several give a row each"
+    made.option("--estimate", None, str, default, meaning, **more)
 
 
 def plans() -> dict[str, str]:
