@@ -50,7 +50,7 @@ class Parser(argparse.ArgumentParser):
         self, name: str, metavar: str | None, kind: Any, default: Any, meaning: str, **more: Any
     ) -> None:
         """An option that takes a value. Its help says the default, where there is one."""
-        shown = " ".join(default) if isinstance(default, list) else default
+        shown = " ".join(map(str, default)) if isinstance(default, list) else default
         text = meaning if shown in (None, "") else f"{meaning} (default {shown})"
         self.add_argument(
             name, metavar=metavar, type=kind, default=default, help=text.lstrip(), **more
