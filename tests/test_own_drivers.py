@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -64,6 +65,17 @@ def test_a_new_course_can_be_driven(capsys):
     assert main(["new", "course", "yard", "--json"]) == DONE
     assert main(["drive", "yard.toml", "--json"]) == DONE
     assert len(json.loads(capsys.readouterr().out.splitlines()[-1])["turns"]) == 2
+
+
+def test_a_new_car_is_read_with_and_without_a_speed_controller(capsys):
+    assert main(["new", "car", "mycar", "--json"]) == DONE
+    assert "drive box --car mycar.toml" in json.loads(capsys.readouterr().out)["try"]
+    car = load_car("mycar.toml")
+    assert float(car.battery.full) == 8.4
+    assert float(car.motor.dead_zone) == float(load_car("rx7").motor.dead_zone)
+    file = Path("mycar.toml")
+    file.write_text(re.sub(r"^# (?=\[speed_|gain|feed)", "", file.read_text(), flags=re.M))
+    assert float(load_car("mycar.toml").speed_controller.gain) == 0.2
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from countersteer.cli.options import DONE, Verbs
 from countersteer.errors import InputError
 from countersteer.writing import alone, write_whole
 
-TEMPLATES = {"driver": "driver.py", "course": "course.toml"}
+TEMPLATES = {"driver": "driver.py", "course": "course.toml", "car": "car.toml"}
 
 
 def add(verbs: Verbs) -> None:
@@ -35,8 +35,10 @@ def run(options: argparse.Namespace) -> int:
     if options.what == "driver":
         text = text.replace("class Driver:", f"class {title}:").replace(":Driver", f":{title}")
         command = f"countersteer drive box --driver {file}:{title}"
-    else:
+    elif options.what == "course":
         command = f"countersteer drive {file}"
+    else:
+        command = f"countersteer drive box --car {file}"
     with alone(file):
         if file.exists():
             raise InputError(f"{file}: is there already: give another name")
