@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from countersteer.cli.options import DONE, WRONG_INPUT, Verbs, one_line, out_file
+from countersteer.cli.options import DONE, WRONG_INPUT, Progress, Verbs, one_line, out_file
 from countersteer.errors import InputError
 from countersteer.runs.importers import FORMATS, importer
 
@@ -28,24 +28,27 @@ def run(options: argparse.Namespace) -> int:
     """`import`."""
     if options.guess:
         return guess(options)
-    from countersteer.cli.report import report_of_import
-
-    to_run = importer(options.format, options.map)
     results: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
-    for file in options.files:
-        try:
-            result = to_run(file, options.out)
-            results.append(result | report_of_import(Path(result["run"])))
-        except InputError as error:  # a bad log does not keep the others from being imported
-            failed.append({"file": str(file), "error": one_line(error)})
-            continue
-        if not options.json:
-            print(f"{file.name} -> {results[-1]['run']}")
-            for doubt in results[-1].get("doubts", ()):
-                print(f"  doubt: {doubt}")
+    lines: list[str] = []
+    with Progress(options.json) as progress:
+        progress.show(0, len(options.files))  # what reads logs takes a second to load
+        from countersteer.cli.report import report_of_import
+
+        to_run = importer(options.format, options.map)
+        for done, file in enumerate(options.files, start=1):
+            try:
+                result = to_run(file, options.out)
+                results.append(result | report_of_import(Path(result["run"])))
+                lines.append(f"{file.name} -> {result['run']}")
+                lines += [f"  doubt: {doubt}" for doubt in result.get("doubts", ())]
+            except InputError as error:  # a bad log does not keep the others from being imported
+                failed.append({"file": str(file), "error": one_line(error)})
+            progress.show(done, len(options.files))
     if options.json:
         print(json.dumps({"runs": results} | ({"failed": failed} if failed else {})))
+    elif lines:
+        print("\n".join(lines))
     for one in failed:
         print(f"countersteer: {one['error']}", file=sys.stderr)
     return WRONG_INPUT if failed else DONE
