@@ -39,7 +39,7 @@ from countersteer.tuning.windows import (
     Measured,
     Reference,
     find_references,
-    read_measured,
+    measured_for,
     simulate,
     speed_at,
     states_at,
@@ -92,7 +92,7 @@ def compare(
     run, repairs = defects.repair(run)
     sensors = resolve(run, car, dt)
     run = sensors.run
-    measured = read_measured(run, car)
+    measured = measured_for(run, car)
     commands = run.commands
     if horizon is None:
         first, last = float(commands["time_s"][0]), float(commands["time_s"][-1])

@@ -36,7 +36,7 @@ from countersteer.runs.run import Run
 from countersteer.signals import Array, SpeedCommand
 from countersteer.tuning import shooting
 from countersteer.tuning.shooting import Shots
-from countersteer.tuning.windows import QUANTITIES, read_measured, why_no_window
+from countersteer.tuning.windows import QUANTITIES, measured_for, why_no_window
 
 STEP = 0.002  # s, of the simulation; its error is then 1 % of the measurement's
 HORIZON = 1.0  # s, length of a window
@@ -233,7 +233,7 @@ def take_shots(
     for i, (run, surface) in enumerate(zip(runs, surfaces, strict=True)):
         found = shooting.take(run, cars[surface], i, names.index(surface), HORIZON, every, STEP)
         if found is None:
-            measured = read_measured(run, cars[surface])
+            measured = measured_for(run, cars[surface])
             reasons.append(why_no_window(run, measured, HORIZON))
             continue
         shots, start = found

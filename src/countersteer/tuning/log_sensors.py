@@ -43,7 +43,7 @@ from countersteer.runs.run import Run
 from countersteer.signals import Wheels
 from countersteer.tuning import windows
 from countersteer.tuning.charge import Charge, contradiction, from_voltmeter
-from countersteer.tuning.windows import EARLY, Measured, Signal, read_measured
+from countersteer.tuning.windows import EARLY, Measured, Signal, measured_for
 from countersteer.world.chassis import Vector, dot
 
 DRIVES = 0.3  # m/s forward; a slower car tells little
@@ -152,7 +152,7 @@ def resolve(run: Run, car: Car, dt: float) -> LogSensors:
     else what the car declares. A run with a car of its own declares by that car. `dt` is the step
     of the steering's simulation (s).
     """
-    measured = read_measured(run, car)
+    measured = measured_for(run, car)
     found = encoder_step(run, measured)
     course = None if measured.vx is None else course_of(run, car, measured, dt)
     if course is not None and len(course.time) >= FEWEST:

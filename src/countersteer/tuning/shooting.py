@@ -23,9 +23,9 @@ from countersteer.tuning.windows import (
     asked,
     body_at,
     find_references,
+    measured_for,
     quantities_of,
     radii,
-    read_measured,
     rims_at,
     rolling,
     spins,
@@ -74,7 +74,7 @@ def take(
     are kept. `number` is the index of the run. The car gives its wheel radii and the timing of its
     sensors.
     """
-    measured = read_measured(run, car)
+    measured = measured_for(run, car)
     ticks = round(horizon / dt)
     starts, resting = windows.window_starts(measured, run.commands, ticks, dt)
     kept: list[int] = []

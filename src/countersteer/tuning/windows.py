@@ -106,15 +106,22 @@ class Reference(NamedTuple):
 # -------------------------------------------------------------------------------------------------
 
 
+def measured_for(run: Run, car: Car) -> Measured:
+    """`read_measured` of a run that the car is to be simulated on.
+
+    Raises `InputError` also if it is commanded in m/s and the car has no speed controller.
+    """
+    if "speed" in run.commands:
+        require_speed_controller(car, f"{run.path}/commands.csv")
+    return read_measured(run, car)
+
+
 def read_measured(run: Run, car: Car) -> Measured:
     """Body velocities, wheel speeds and sensor readings of a run.
 
-    Raises `InputError` if the run is too long, if its poses are too close in time, or if it is
-    commanded in m/s and the car has no speed controller.
+    Raises `InputError` if the run is too long, or if its poses are too close in time.
     """
     refuse_long(run)
-    if "speed" in run.commands:
-        require_speed_controller(car, f"{run.path}/commands.csv")
     vx = vy = yaw_rate = wheels = None
     truth = run.truth
     if truth is not None and len(truth):
