@@ -87,6 +87,7 @@ KINDS = {
     )
 }
 STEP_DIFFERS = 0.02  # part of a declared step
+NUMBER_FORMAT = 0.005  # m/s; a smaller step is how a logger writes, and matters to nothing
 
 
 class Estimate(NamedTuple):
@@ -107,7 +108,11 @@ class Estimate(NamedTuple):
     @property
     def contradicts(self) -> bool:
         """True if the log tells another number than the declared one."""
-        differs = STEP_DIFFERS * self.declared if self.kind.key == "step_mps" else self.kind.differs
+        differs = self.kind.differs
+        if self.kind.key == "step_mps":
+            if self.value < NUMBER_FORMAT:
+                return False
+            differs = STEP_DIFFERS * self.declared
         return self.sure and abs(self.value - self.declared) > max(differs, 3 * self.deviation)
 
     def as_json(self) -> dict[str, Any]:

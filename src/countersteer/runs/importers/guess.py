@@ -199,10 +199,14 @@ def _time(column: Column) -> Guess:
 def _share(column: Column) -> Guess:
     known, most = column.known, column.most
     if _unit(column, "share") == "us" or (len(known) and known[0] > 700 and most < 2400):
-        rest = float(np.median(known))
-        zero = 1500.0 if abs(rest - 1500) > 150 else round(rest)
-        entry: dict[str, object] = {"unit": "us", "zero": zero, "span": 500}
-        return Guess(column.name, entry, "zero and span are a servo's usual pulses")
+        # A stick rests more often than it is anywhere else.
+        pulses, counts = np.unique(np.round(known), return_counts=True)
+        rest = float(pulses[np.argmax(counts)])
+        zero, why = 1500.0, "zero and span are a servo's usual pulses"
+        if 0 < abs(rest - 1500) <= 150:
+            zero, why = rest, "zero is the most frequent pulse, and span a servo's usual one"
+        entry: dict[str, object] = {"unit": "us", "zero": round(zero), "span": 500}
+        return Guess(column.name, entry, why)
     if most <= 1.05:
         return Guess(column.name, {"unit": "1"})
     if known[0] >= 0 and most <= 105 and abs(float(known[0]) - 50) < abs(float(known[0])):
