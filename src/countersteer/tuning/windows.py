@@ -170,8 +170,10 @@ def encoder_sees(run: Run, car: Car) -> Wheels:
 
 def shares(on: str, car: Car) -> Wheels:
     """The share of each wheel in what an encoder sees there; the shaft's is of driven wheels."""
+    if on == "wheels":
+        return MEAN
     if on != "shaft":
-        return Wheels(*(float(on == place) for place in ENCODER_ON[1:]))
+        return Wheels(*(float(on == place) for place in ENCODER_ON[1:5]))
     front = float(car.drivetrain.front_share) / 2
     return Wheels(front, front, 0.5 - front, 0.5 - front)
 
@@ -467,9 +469,10 @@ def rolling(
     joined = drive.center_lock > 0
     front, rear = (drive.front_share > 0) | joined, (drive.front_share < 1) | joined
     sees_front, sees_rear = (sees.front_left + sees.front_right, sees.rear_left + sees.rear_right)
-    sees_driven = (front & (sees_front > 0)) | (rear & (sees_rear > 0))
+    seen_driven = front * sees_front + rear * sees_rear  # part of the reading that can slip
+    share = jnp.where(seen_driven > 0, seen_driven, 1.0)
     slips = [
-        slip * jnp.where(sees_driven, driven, saw > 0)
+        slip / share * jnp.where(seen_driven > 0, driven, saw > 0)
         for driven, saw in ((front, sees_front), (rear, sees_rear))
     ]
     return tuple(hub + slips[axle] for hub, axle in zip(hubs, (0, 0, 1, 1), strict=True))

@@ -102,6 +102,11 @@ def converted(log: Path, format_name: str, recipe: Recipe, find: Find) -> Import
         "signals": sorted(found),
         "doubts": doubts,
     }
+    if "wheel_speed" in found:
+        # Not where the encoder of the car sits that is compared, unless the mapping says so.
+        sensors = about.get("sensors", {})
+        encoder = {"on": "wheels", **sensors.get("encoder", {})}
+        about["sensors"] = {**sensors, "encoder": encoder}
     rows = max(len(series.time) for series in found.values())
     return Imported(about, rows, time, motor, steering, telemetry, truth, drive == "speed")
 
