@@ -26,6 +26,7 @@ from countersteer.pilot import Pilot
 from countersteer.recorded_drive import Drive, about_run, drive
 from countersteer.runs.files import Table
 from countersteer.runs.run import Run, read_run
+from countersteer.signals import Command
 from countersteer.simulator import Simulator
 from countersteer.tuning import fit
 from countersteer.tuning.tune import read_logs
@@ -71,7 +72,7 @@ def log(car: Car, folder: Path, rng: np.random.Generator) -> Run:
     throttle = np.append(0.0, rng.uniform(0.25, 0.9, len(times) - 1))
     steering = np.append(0.0, np.radians(rng.uniform(-25, 25, len(times) - 1)))
     seed = int(rng.integers(2**31))
-    driver = Replay(times=times, throttle=throttle, steering=steering)
+    driver = Replay(times=times, commands=Command(throttle, steering))
     simulator, pilot = Simulator.of(None, car, seed=seed), Pilot.of(driver, None, car)
     about = about_run(simulator, pilot, None, "replay", BASE, 1, car, {"kind": "replay"})
     folder.mkdir()

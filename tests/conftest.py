@@ -21,7 +21,7 @@ from countersteer.recorded_drive import Drive as Recorded
 from countersteer.recorded_drive import about_run
 from countersteer.recorded_drive import drive as write_drive
 from countersteer.runs.run import Run, read_run
-from countersteer.signals import Motion
+from countersteer.signals import Command, Motion
 from countersteer.simulator import Record, Simulator
 from countersteer.task import turns
 from countersteer.task.judge import PERIOD, Sample, Score, Task
@@ -179,7 +179,7 @@ def step_run(
 ) -> Run:
     """A run of a throttle from rest, straight, and none after so many seconds."""
     driver = Replay(
-        times=np.array([0.0, seconds]), throttle=np.array([level, 0.0]), steering=np.zeros(2)
+        times=np.array([0.0, seconds]), commands=Command(np.array([level, 0.0]), np.zeros(2))
     )
     out.mkdir()
     return write_run(out, course, car, driver, longest, **more)

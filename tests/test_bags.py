@@ -296,7 +296,7 @@ def test_a_damaged_bag_is_read_or_refused(tmp_path, name):
     {".bag": write_ros1, ".db3": write_sqlite, ".mcap": write_mcap}[log.suffix](log)
     whole = log.read_bytes()
     random = np.random.default_rng(1)
-    refused = 0  # any other exception fails the test
+    refused = 0  # what the library raises is told as one line too
     for _ in range(30):
         length = random.integers(len(whole)) if random.random() < 0.5 else len(whole)
         content = bytearray(whole[:length])
@@ -316,9 +316,9 @@ def test_a_small_chunk_that_unpacks_to_a_huge_one_is_refused(tmp_path, monkeypat
     assert "unpacks to over 1 MB" in refusal(tmp_path / "log.bag")
 
 
-@pytest.mark.parametrize("kind", ["a/msg/b\nimport os", "os.system('x')/Y", "../x/Y", "x"])
+@pytest.mark.parametrize("kind", ["a/msg/b\nimport os", "os.system('x')/Y", "../x/Y"])
 def test_the_name_of_a_type_is_a_name(tmp_path, kind):
     write_ros1(tmp_path / "log.bag", kind=kind)
     mapping = 'speed = { from = "/drive", column = "drive.speed", unit = "m/s" }\n'
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="is no type of messages"):
         imported(tmp_path / "log.bag", mapping)

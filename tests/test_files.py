@@ -39,6 +39,7 @@ from countersteer.runs.files import column_rows, command_rows, read_commands, re
 from countersteer.runs.recorder import Pace, Recorder, new_folder
 from countersteer.runs.run import read_run
 from countersteer.sensing.all_sensors import channels
+from countersteer.signals import Command
 from countersteer.text import read_text, tables_of
 from countersteer.viewing.picture import draw_picture
 from countersteer.viewing.report import report_html
@@ -559,7 +560,7 @@ def test_frames_of_a_car_with_a_clock_of_its_own_are_all_kept(tmp_path):
     """Every 9 to 11 ms, a millisecond after the readings were taken."""
     car = load_car("rx7")
     record = driven(
-        None, car, Replay(times=np.zeros(1), throttle=np.ones(1), steering=np.zeros(1)), 1.0
+        None, car, Replay(times=np.zeros(1), commands=Command(np.ones(1), np.zeros(1))), 1.0
     )
     ticks = np.cumsum(np.random.default_rng(0).integers(9, 12, 90)) + 1
     whole = frames(record, len(record.tick))

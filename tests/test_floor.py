@@ -18,6 +18,7 @@ from countersteer.course.files import load_course
 from countersteer.drivers.replay import Replay
 from countersteer.errors import InputError
 from countersteer.runs.run import read_run
+from countersteer.signals import Command
 from countersteer.world import floor, planar
 from countersteer.world.angle import cosine
 from countersteer.world.floor import Floor, Wave
@@ -222,7 +223,7 @@ def test_a_drive_on_a_floor_is_replayed_on_it(
     (ground,) = draws(2, 1, 0.2)
     course = load_course("straight")
     driver = Replay(
-        times=np.array([0.0, 0.8]), throttle=np.array([0.8, 0.0]), steering=np.array([0.0, -0.4])
+        times=np.array([0.0, 0.8]), commands=Command(np.array([0.8, 0.0]), np.array([0.0, -0.4]))
     )
     for name, floor_of in (("uneven", ground), ("even", None)):
         (tmp_path / name).mkdir()

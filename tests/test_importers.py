@@ -143,7 +143,7 @@ def test_a_pose_is_moved_to_the_centre_of_mass_and_a_quaternion_is_a_heading(tmp
     mapping = with_entry("wheel_speed", 'column = "X", unit = "m/s"') + (
         '\nx = { column = "X", unit = "m" }\ny = { column = "Y", unit = "m" }\n'
         'heading = { columns = ["qx", "qy", "qz", "qw"], unit = "quaternion" }\n'
-        "capture_point = { x_m = 1.0 }\n"
+        "sensors.capture.x_m = 1.0\n"
     )
     run = imported(tmp_path, "\n".join(["t,u,d,X,Y,qx,qy,qz,qw", *rows]), mapping)
     np.testing.assert_allclose(np.diff(run.truth["heading_rad"]), 0.1, atol=1e-9)
@@ -210,6 +210,7 @@ def test_files_may_be_written_in_other_ways(tmp_path, text):
         (with_entry("x", 'column = "v", unit = "m"'), "x needs y, heading too"),
         (PLAIN + f"pole_pairs = {'9' * 400}", "a whole number of some 400 digits"),
         (PLAIN + "sensors.encoder.lag_s = -1", "sensors.encoder.lag_s"),
+        (PLAIN + 'sensors.gyroscope.unit = "deg/s"', "give the signal its unit instead"),
         (PLAIN + "[", "not valid TOML"),
         (PLAIN + "gyro = []", "gyro must be an entry"),
     ],
@@ -328,6 +329,9 @@ def test_a_guessed_mapping_imports_the_log_that_it_was_guessed_from(tmp_path, ca
         ("t,throttle,d", "{t},62,0", "throttle", {"unit": "%", "zero": 50, "span": 50}),
         ("t,cmd_speed_mps,d", "{t},2,0", "speed", {"unit": "m/s"}),
         ("t,thr,yaw_rate", "{t},0.4,1.5", "gyro", {"unit": "rad/s"}),
+        ("t,thr,gyro_radps", "{t},0.4,1.5", "gyro", {"unit": "rad/s"}),
+        ("t,thr,gyro_dps", "{t},0.4,150", "gyro", {"unit": "deg/s"}),
+        ("t,thr,wheel_speed_radps", "{t},0.4,9", "wheel_speed", {"unit": "rad/s"}),
         ("t,thr,yaw_rate", "{t},0.4,150", "gyro", {"unit": "deg/s"}),
         ("t,thr,speed_FL,speed_FR", "{t},0.4,1,2", "wheel_speed", {"unit": "m/s"}),
         ("s,ns,thr,v", "{t},5,0.4,1", "time", {"columns": ["s", "ns"], "unit": ["s", "ns"]}),

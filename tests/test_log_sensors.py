@@ -275,6 +275,10 @@ def test_an_own_log_in_order_is_not_refused():
     slides.telemetry["gyro_radps"] *= -2.5  # turned back hard in a drift
     slides.telemetry["wheel_speed_mps"] *= 3
     refuse(slides)
+    backs = own_log()  # an encoder has no sign
+    backs.telemetry["gyro_radps"] *= -1
+    backs.commands["throttle"] *= -1
+    refuse(backs)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from countersteer.course.files import load_course
 from countersteer.drivers.replay import Replay
 from countersteer.errors import InputError
 from countersteer.sensing import all_sensors, error_models, lidar, sonar
-from countersteer.signals import Motion
+from countersteer.signals import Command, Motion
 
 RX7 = load_car("rx7")
 SCENES = 1000  # always as many, so that there is one program for each number of mounts
@@ -629,7 +629,7 @@ def test_sensors_begin_for_cars_of_a_batch_too() -> None:
 def test_better_sensors_are_switched_on_and_written(tmp_path: Path) -> None:
     wanted = ("sensors.lidar.beams=12", "sensors.lidar.rate_hz=20", "sensors.position.reports=pose")
     car = load_car("rx7", wanted)
-    driver = Replay(times=np.zeros(1), throttle=np.ones(1), steering=np.zeros(1))
+    driver = Replay(times=np.zeros(1), commands=Command(np.ones(1), np.zeros(1)))
     run = write_run(tmp_path, None, car, driver, 0.5)
     assert run.about["rates"]["lidar_s"] == pytest.approx(0.05)
     assert run.car.sensors.lidar.beams == 12

@@ -1,7 +1,9 @@
 """Cars that are commanded in m/s: the speed controller, and logs of such cars."""
 
+import math
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,7 +19,7 @@ from countersteer.course.files import load_course
 from countersteer.drivers.registry import make_driver
 from countersteer.errors import InputError
 from countersteer.link.link import RADIO
-from countersteer.pilot import Pilot
+from countersteer.pilot import Pilot, bounded, checked
 from countersteer.runs.files import read_commands
 from countersteer.runs.run import Run, read_run
 from countersteer.signals import AnyCommand, Command, SpeedCommand
@@ -158,6 +160,14 @@ def test_the_case_of_a_car_commanded_in_metres_a_second(tmp_path, capsys):
     assert run.commands["speed"][0] == 1.478
     assert run.truth["vx_mps"][-1] > 0.9
     assert "Commanded speed" in (Path(out) / "report.html").read_text()
+
+
+def test_a_driver_in_python_may_command_speeds():
+    driver = SimpleNamespace(command_type=SpeedCommand)
+    command, memory = checked(driver, (SpeedCommand(2.5, 0.1), 7))
+    assert (type(bounded(command)), float(bounded(command).speed), memory) == (SpeedCommand, 2.5, 7)
+    with pytest.raises(InputError, match="speed must be a finite number"):
+        checked(driver, (SpeedCommand(math.nan, 0.1), 7))
 
 
 def test_a_course_is_driven_by_commanded_speeds_on_board_and_not_over_a_radio(tmp_path):

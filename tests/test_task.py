@@ -19,7 +19,7 @@ from countersteer.judge_run import judge_run, samples_of
 from countersteer.runs.files import Table
 from countersteer.runs.importers.dart import import_dart
 from countersteer.runs.run import read_run
-from countersteer.signals import Motion, Wheels
+from countersteer.signals import Command, Motion, Wheels
 from countersteer.task import turns
 from countersteer.task.judge import Outcome, Sample, Task, summary
 
@@ -364,7 +364,7 @@ def test_a_sample_that_is_no_number_ends_a_drive_and_spoils_no_turn():
 
 
 def test_without_a_course_a_drive_is_done_when_it_is_over(tmp_path):
-    driver = Replay(times=np.zeros(1), throttle=np.array([0.5]), steering=np.zeros(1))
+    driver = Replay(times=np.zeros(1), commands=Command(np.array([0.5]), np.zeros(1)))
     (tmp_path / "run").mkdir()
     run = write_run(tmp_path / "run", None, CAR, driver, 1.0)
     _, told = judge_run(run, None)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from countersteer.batch import evaluate as evaluation
+from countersteer.batch.margin import Margin
 from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.compiling import configure_jax
@@ -166,8 +167,10 @@ def evaluate(
         estimate, dt,
     )  # fmt: skip
     with Progress() as progress:
-        score = many.run(lambda v: load_driver(driver, where, nominal, v, laps), progress.show)
-    return evaluation.results(score, seeds)
+        score, margins = many.run_watched(
+            lambda v: load_driver(driver, where, nominal, v, laps), Margin.of(where), progress.show
+        )
+    return evaluation.results(score, seeds, margins)
 
 
 def _check(**choices: tuple[str, Iterable[str]]) -> None:

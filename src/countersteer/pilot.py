@@ -87,7 +87,7 @@ class Pilot:
 
         Raises `InputError` for a driver that commands speeds over a radio, which sends throttles.
         """
-        if not link.onboard and getattr(driver, "command_type", Command) is SpeedCommand:
+        if not link.onboard and command_type(driver) is SpeedCommand:
             raise InputError(f"the {link.name} sends throttles, and the commands are in m/s")
         period = link.control_period
         if not traceable(driver):
@@ -163,8 +163,7 @@ class Pilot:
                 where = f"{type(self.driver).__name__}.act at {self.dt * int(tick):.3f} s"
                 raise InputError(f"{where}: {told_in_a_line(error)}") from error
             command, own = checked(self.driver, answer)
-            asked = (np.clip(command.throttle, -1, 1), np.clip(command.steering, *LOCKS))
-            command = Command(*map(self.dtype.type, asked))
+            command = jax.tree.map(self.dtype.type, bounded(command))
             return command, PilotMemory(estimate, own, command)
 
     def observe(
@@ -213,7 +212,7 @@ def _init(pilot: Pilot, root: jax.Array) -> PilotMemory:
     if pilot.traced:
         memory = jax.tree.map(lambda leaf: _typed(leaf, dtype), memory)
     zero = dtype.type(0)
-    first = getattr(pilot.driver, "command_type", Command)(zero, zero)
+    first = command_type(pilot.driver)(zero, zero)
     return PilotMemory(estimate, memory, first)
 
 
@@ -273,11 +272,17 @@ def traceable(driver: Any) -> bool:
     return not jax.tree_util.all_leaves([driver])
 
 
-def checked(driver: Any, answer: Any) -> tuple[Command, Any]:
+def command_type(driver: Any) -> type[AnyCommand]:
+    """What a driver commands: `Command`, or what its `command_type` says."""
+    return getattr(driver, "command_type", Command)
+
+
+def checked(driver: Any, answer: Any) -> tuple[AnyCommand, Any]:
     """The checked result of a Python driver's `act`. Raises `InputError` if it is wrong."""
     name = f"{type(driver).__name__}.act"
+    kind = command_type(driver)
     # A command alone is a pair as well.
-    if isinstance(answer, Command) or not isinstance(answer, tuple) or len(answer) != 2:
+    if isinstance(answer, kind) or not isinstance(answer, tuple) or len(answer) != 2:
         raise InputError(
             f"{name} must return (Command(throttle, steering), memory), not {answer!r:.60}"
         )
@@ -286,14 +291,14 @@ def checked(driver: Any, answer: Any) -> tuple[Command, Any]:
         raise InputError(
             f"{name} must return a Command(throttle, steering) first, not {command!r:.60}"
         )
-    for key, value in zip(Command._fields, command, strict=True):
+    for key, value in zip(kind._fields, command, strict=True):
         try:
             number = float(value)
         except (TypeError, ValueError):
             number = math.nan
         if not math.isfinite(number):
             raise InputError(f"{name}: {key} must be a finite number, not {value!r:.60}")
-    return Command(*map(float, command)), memory
+    return kind(*map(float, command)), memory
 
 
 def bounded(command: AnyCommand) -> AnyCommand:

@@ -21,12 +21,12 @@ from countersteer.drivers.driver import ROUNDING, Observation, Status, status_of
 from countersteer.drivers.registry import make_driver
 from countersteer.errors import InputError
 from countersteer.link.link import ONBOARD, Link
-from countersteer.pilot import Pilot
+from countersteer.pilot import Pilot, command_type
 from countersteer.runs.files import COVARIANCE, ESTIMATE, ROLLOUTS, read_commands
 from countersteer.runs.recorder import Frames, Pace, Recorder
 from countersteer.sensing.all_sensors import channels
 from countersteer.sensing.faults import SensorFault, fault_tables
-from countersteer.signals import Command, Motion, Wheels, truth_columns
+from countersteer.signals import Motion, Wheels, truth_columns
 from countersteer.simulator import PIECE, Record, Simulator
 from countersteer.task.judge import PERIOD, Outcome, Sample, Task, samples, summary
 from countersteer.world.floor import Floor, floor_tables
@@ -259,7 +259,7 @@ def drive(
     planner = pilot.driver if isinstance(pilot.driver, Watched) else None
     if planner is not None:
         more["rollouts"] = ROLLOUTS
-    sensors, command = channels(simulator.car), getattr(pilot.driver, "command_type", Command)
+    sensors, command = channels(simulator.car), command_type(pilot.driver)
     with Recorder(
         folder, about, channels=sensors, pace=pace, command=command, more=more
     ) as recorder:

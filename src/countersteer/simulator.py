@@ -341,14 +341,13 @@ def steps(
 ) -> tuple[Loop, PilotMemory, Record]:
     """`scan` for any pilot, one decision at a time."""
     records = []
+    told = pilot.status(memory), pilot.estimate(memory)
     for _ in range(ticks // pilot.control):
-        before = pilot.status(memory), pilot.estimate(memory)
         command, memory = pilot.act(memory, simulator.readings(loop), loop.tick)
         loop, record = simulator.apply(loop, command, pilot.control)
+        before, told = told, (pilot.status(memory), pilot.estimate(memory))
         status, estimate = jax.tree.map(
-            lambda before, after: np.array([before, *[after] * (pilot.control - 1)]),
-            before,
-            (pilot.status(memory), pilot.estimate(memory)),
+            lambda before, after: np.array([before, *[after] * (pilot.control - 1)]), before, told
         )
         kept = jax.tree.map(np.asarray, record)
         records.append(kept._replace(status=status, estimate=estimate))

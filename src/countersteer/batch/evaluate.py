@@ -143,7 +143,7 @@ def results(
         **overshoot(np.degrees(turns.overshoot[counted])),
         "entry_speed_mps_median": median(turns.entry_speed[counted]),
         "lap_time_s_median": median(score.goal_time[won]),
-        "wall_margin_m_median": None if margins is None else median(margins[won]),
+        **({} if margins is None else {"wall_margin_m_median": median(margins[won])}),
         "failed_seeds": [int(seed) for seed in numbers[~won]],
         "failures": {
             Outcome.of(code).value: [int(seed) for seed in numbers[score.outcome == code]]

@@ -63,19 +63,19 @@ class Margin:
 
         ends = [to_body(self.walls[:, i], self.walls[:, i + 1]) for i in (0, 2)]
         half_length, half_width = body.length / 2, body.width / 2
-        nearest: Any = jnp.inf
+        nearest: Any = jnp.inf  # squared
         for x, y in ends:
             ahead = jnp.maximum(jnp.abs(x) - half_length, 0.0)
             aside = jnp.maximum(jnp.abs(y) - half_width, 0.0)
-            nearest = jnp.minimum(nearest, jnp.sqrt(ahead**2 + aside**2))
+            nearest = jnp.minimum(nearest, ahead**2 + aside**2)
         (ax, ay), (bx, by) = ends
         length2 = jnp.maximum((bx - ax) ** 2 + (by - ay) ** 2, 1e-12)
         for cx in (half_length, -half_length):
             for cy in (half_width, -half_width):
                 on = jnp.clip(((cx - ax) * (bx - ax) + (cy - ay) * (by - ay)) / length2, 0.0, 1.0)
                 dx, dy = ax + on * (bx - ax) - cx, ay + on * (by - ay) - cy
-                nearest = jnp.minimum(nearest, jnp.sqrt(dx**2 + dy**2))
-        return jnp.min(jnp.where(jnp.isnan(self.walls[:, 0]), jnp.inf, nearest))
+                nearest = jnp.minimum(nearest, dx**2 + dy**2)
+        return jnp.sqrt(jnp.min(jnp.where(jnp.isnan(self.walls[:, 0]), jnp.inf, nearest)))
 
 
 @jax.jit

@@ -153,7 +153,7 @@ def commands(*steps: tuple[float, float, float]) -> Replay:
     """A driver with up to `STEPS` open-loop steps of time (s), throttle and steering (rad)."""
     # The same number for all, so that they share a program.
     padded = np.array([*steps, *[steps[-1]] * (STEPS - len(steps))]).T
-    return Replay(times=padded[0], throttle=padded[1], steering=padded[2])
+    return Replay(times=padded[0], commands=Command(padded[1], padded[2]))
 
 
 def repeated(car: Car, count: int) -> Car:

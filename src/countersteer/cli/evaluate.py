@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
                     driver, tables = make_driver(
                         name, course, nominal, speed, options.laps, read_commands
                     )
-                    told.update(tables, traced=traceable(driver))
+                    told.update(tables)
                     return driver
 
                 def report(done: int, trials: int, before: int = i) -> None:
@@ -142,15 +142,8 @@ def run(options: argparse.Namespace) -> int:
 def _command(options: argparse.Namespace, driver: str, estimate: str, count: int) -> str:
     """The command that makes a row of the league again."""
     words = ["countersteer", "evaluate", options.course, "--driver", driver]
-    words += [
-        "--trials",
-        count,
-        "--seed",
-        options.seed,
-        "--cars",
-        options.cars,
-        *_shared(options, estimate),
-    ]
+    words += ["--trials", count, "--seed", options.seed, "--cars", options.cars]
+    words += _shared(options, estimate)
     return shlex.join(map(str, words))
 
 

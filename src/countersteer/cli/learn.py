@@ -104,6 +104,17 @@ def say(options: argparse.Namespace, line: str) -> None:
         print(line, flush=True)
 
 
+def in_blocks() -> int:
+    """Get JAX ready for batches in one program (`engine.in_one_program`); returns the cores."""
+    from countersteer.batch.engine import flags
+    from countersteer.compiling import configure_jax
+
+    cores = os.cpu_count() or 1
+    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    configure_jax(blocks=True, cores=cores)
+    return cores
+
+
 def run_stop_angle(options: argparse.Namespace) -> int:
     """`learn stop-angle`."""
     with out_file(options.out):
@@ -154,19 +165,18 @@ def learn_turn(options: argparse.Namespace) -> int:
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     courses = [load_course(name) for name in options.courses]
     history: list[dict[str, float]] = []
-
     begun = time.process_time()
 
     def report(number: int, found: Generation) -> None:
         done = {"generation": number + 1.0, "cpu_s": time.process_time() - begun}
         history.append(done | found._asdict())
-        if not options.json:
-            print(
-                f"  {number + 1:3} of {options.generations}: cost {found.cost:.3f}, "
-                f"{100 * found.success_rate:.0f} % get round, {100 * found.drift_share:.0f} % of "
-                f"them drift every turn; best candidate {found.best_cost:.3f}".replace("nan", "-"),
-                flush=True,
-            )
+        drifts = f"{100 * found.drift_share:.0f}" if found.success_rate else "-"
+        say(
+            options,
+            f"  {number + 1:3} of {options.generations}: cost {found.cost:.3f}, "
+            f"{100 * found.success_rate:.0f} % get round, {drifts} % of them drift every turn; "
+            f"best candidate {found.best_cost:.3f}",
+        )
 
     car, population = load_car(options.car), load_population(options.cars)
     policy = search(
@@ -213,19 +223,14 @@ def run_ppo(options: argparse.Namespace) -> int:
 
 def learn_ppo(options: argparse.Namespace) -> int:
     """The training of a network. Killed, the same command goes on from the last checkpoint."""
-    from countersteer.batch.engine import flags
-
-    cores = os.cpu_count() or 1
-    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    cores = in_blocks()
     from countersteer.batch.evaluate import table_lines
     from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
-    from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.errors import InputError
     from countersteer.task.reward import DRIFTING, weights_of
 
-    configure_jax(blocks=True, cores=cores)
     try:
         from countersteer.learning import ppo
     except ModuleNotFoundError as error:
@@ -277,7 +282,7 @@ def run_tabular(options: argparse.Namespace) -> int:
 
 
 def tabular_job(
-    options: argparse.Namespace, course: Any, car: Any, dimensions: Sequence[str], weights: Any
+    options: argparse.Namespace, course: Any, car: Any, dimensions: Sequence[str]
 ) -> Any:
     """The `learning.tabular.Job` of the options. Raises `InputError`."""
     from countersteer.learning import tabular
@@ -292,21 +297,17 @@ def tabular_job(
         tuple(map(math.radians, options.steering_deg)),
         0.02 * round(options.decision_s / 0.02),
         options.horizon_s,
-        weights_of(options.reward, weights, tabular.TERMS),
+        weights_of(options.reward, tabular.WEIGHTS, tabular.TERMS),
         options.margin_m,
     )
 
 
 def learn_tabular(options: argparse.Namespace) -> int:
     """The table, its solution, the drive of the nominal car, and the verdict of random ones."""
-    from countersteer.batch.engine import flags
-
-    cores = os.cpu_count() or 1
-    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    cores = in_blocks()
     from countersteer.batch.evaluate import nominal_drive, table_lines, verdict
     from countersteer.batch.population import load_population
     from countersteer.car.files import load_car
-    from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.drivers.registry import learned
     from countersteer.learning import tabular
@@ -315,10 +316,9 @@ def learn_tabular(options: argparse.Namespace) -> int:
     from countersteer.viewing.slices import draw_slices
     from countersteer.writing import whole, write_whole
 
-    configure_jax(blocks=True, cores=cores)
     course, car = load_course(options.course), load_car(options.car)
     population = load_population(options.cars)
-    job = tabular_job(options, course, car, tabular.DIMENSIONS, tabular.WEIGHTS)
+    job = tabular_job(options, course, car, tabular.DIMENSIONS)
     count = len(job.actions.throttle)
     say(
         options,
@@ -381,21 +381,16 @@ def run_online(options: argparse.Namespace) -> int:
 
 def learn_online(options: argparse.Namespace) -> int:
     """The learners that drive, with random actions and without, beside dynamic programming."""
-    from countersteer.batch.engine import flags
-
-    cores = os.cpu_count() or 1
-    os.environ.setdefault("XLA_FLAGS", flags(cores))
+    cores = in_blocks()
     from countersteer.car.files import load_car
-    from countersteer.compiling import configure_jax
     from countersteer.course.files import load_course
     from countersteer.learning import online, tabular
     from countersteer.runs.files import csv_text
     from countersteer.viewing.learners import draw_learners
     from countersteer.writing import whole, write_whole
 
-    configure_jax(blocks=True, cores=cores)
     course, car = load_course(options.course), load_car(options.car)
-    job = tabular_job(options, course, car, online.DIMENSIONS, online.WEIGHTS)
+    job = tabular_job(options, course, car, online.DIMENSIONS)
     say(options, f"{job.table.size:,} states; compiles for a minute or two first")
     learners = online.Online(job, options.seconds)
     found = {}

@@ -96,7 +96,8 @@ def compare(options: argparse.Namespace) -> int:
             f"{len(folders)} runs: at most {MOST_RUNS} are shown side by side (--each)"
         )
     views = with_places([view_of(read_run(folder)) for folder in folders])
-    page = options.out or folders[0] / f"report-with-{folders[1].resolve().name}.html"
+    others = "-".join(folder.resolve().name for folder in folders[1:])
+    page = options.out or folders[0] / f"report-with-{others}.html"
     if page.suffix != ".html":
         raise InputError(f"--out {page}: name a .html file")
     write_whole(page, report_html(*views))

@@ -15,10 +15,11 @@ from countersteer.drivers.drift_turn import drift_turn
 from countersteer.drivers.driver import Driver
 from countersteer.drivers.plan import Read
 from countersteer.drivers.pursuit import pursuit
-from countersteer.drivers.replay import Replay, SpeedReplay
+from countersteer.drivers.replay import Replay
 from countersteer.drivers.straighten import straighten
 from countersteer.errors import InputError
 from countersteer.reading.values import short, shown
+from countersteer.signals import Command, SpeedCommand
 from countersteer.text import nearest, read_toml
 
 KINDS = (policy.KIND, "plan")  # of a file
@@ -58,7 +59,7 @@ def make_driver(
     elif name in LEARNED:
         tables = {"kind": name, "file": str(stored.policy_for(name, course, car)), **tables}
     elif name.endswith(".npz"):
-        tables = {"kind": stored.kind_of(Path(name)), "file": name, **tables}
+        tables = {"kind": stored.about_of(Path(name))["kind"], "file": name, **tables}
     elif name.endswith(".toml") or name in (policy.KIND, *plan.library()):
         numbers, where = read_toml(name, plan.LIBRARY, "driver")
         kind = numbers.get("kind")
@@ -123,7 +124,7 @@ def learned_at(tables: Mapping[str, Any]) -> dict[str, Any]:
     kind = tables.get("kind")
     if kind not in LEARNED:
         return {}
-    about = stored.read(Path(str(tables["file"])), str(kind))[1]
+    about = stored.about_of(Path(str(tables["file"])))
     parts = [about.get("learned_with"), about.get("cost")]
     told = {key: value for part in parts if isinstance(part, dict) for key, value in part.items()}
     return {
@@ -133,9 +134,7 @@ def learned_at(tables: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def replay(commands: Mapping[str, np.ndarray]) -> Replay | SpeedReplay:
+def replay(commands: Mapping[str, np.ndarray]) -> Replay:
     """A driver that replays the columns of `runs.files.read_commands`."""
-    times, steering = commands["time_s"], commands["steering"]
-    if "speed" in commands:
-        return SpeedReplay(times=times, speed=commands["speed"], steering=steering)
-    return Replay(times=times, throttle=commands["throttle"], steering=steering)
+    kind, drive = (SpeedCommand, "speed") if "speed" in commands else (Command, "throttle")
+    return Replay(times=commands["time_s"], commands=kind(commands[drive], commands["steering"]))

@@ -39,32 +39,30 @@ def packed(arrays: Mapping[str, Any], about: Mapping[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays of a file of this kind, and what it says. Raises `InputError` in one line."""
-    where, wrong = short(str(path)), f"is no policy of 'learn {kind}'"
-    try:
-        _check_size(path)
-        with np.load(path) as file:
-            held = {name: file[name] for name in file.files}
-        about = json.loads(held.pop("about").tobytes().decode())
-    except BROKEN as error:
-        raise InputError(f"{where}: {wrong}: {error}") from None
-    if not isinstance(about, dict) or about.get("kind") != kind:
-        raise InputError(f"{where}: {wrong}")
-    return held, about
-
-
-def kind_of(path: Path) -> str:
-    """The kind that a file says it is of. Raises `InputError` in one line."""
+def about_of(path: Path) -> dict[str, Any]:
+    """What a file says, without its other arrays. Raises `InputError` in one line."""
     where = short(str(path))
     try:
         _check_size(path)
         with np.load(path) as file:
             about = json.loads(file["about"].tobytes().decode())
-        kind = about["kind"]
+        if not isinstance(about["kind"], str):
+            raise ValueError("it names no kind")
     except BROKEN as error:
         raise InputError(f"{where}: is no policy of 'learn': {error}") from None
-    return str(kind)
+    return dict(about)
+
+
+def read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays of a file of this kind, and what it says. Raises `InputError` in one line."""
+    where, about = short(str(path)), about_of(path)
+    if about["kind"] != kind:
+        raise InputError(f"{where}: is no policy of 'learn {kind}'")
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files if name != "about"}, about
+    except BROKEN as error:
+        raise InputError(f"{where}: is no policy of 'learn {kind}': {error}") from None
 
 
 def _check_size(path: Path) -> None:
@@ -111,7 +109,8 @@ def policy_for(kind: str, course: Course, car: Car) -> Path:
     """The library's policy for a course and a car. Raises `InputError` if there is none."""
     mine = fingerprint(course, car)
     for path in library():
-        if kind_of(path) == kind and read(path, kind)[1].get("fingerprint") == mine:
+        about = about_of(path)
+        if about["kind"] == kind and about.get("fingerprint") == mine:
             return path
     raise InputError(
         f"no policy is stored for the course {course.name} with this car; "

@@ -83,7 +83,7 @@ def spread(course: Course, car: Car, commands: list[Command], first: int = SEED)
     pose = drawn.pose + np.array([along, 0.0, 0.0], np.float32)
     still = np.zeros(count)
     times = KNOT * np.arange(len(commands[0].throttle))
-    drivers = [Replay(times=times, throttle=c.throttle, steering=c.steering) for c in commands]
+    drivers = [Replay(times=times, commands=one) for one in commands]
     velocity = np.stack([SPEED + still, still, still], axis=1)
     sampled = drives(
         drawn.cars, drawn.charge, drivers, velocity, SECONDS + 1.0, pose, course.walls, drawn.floor

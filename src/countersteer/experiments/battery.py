@@ -13,6 +13,7 @@ from countersteer.batch.engine import LANES
 from countersteer.batch.open_drives import commands, drives, repeated
 from countersteer.car.car import Car
 from countersteer.car.parameter import changed
+from countersteer.drivers.registry import replay
 from countersteer.drivers.replay import Replay
 from countersteer.experiments.result import Report, Result, silent
 from countersteer.runs.run import Run, drawn_car
@@ -35,7 +36,7 @@ def simulate(car: Car, name: str, report: Report = silent, lanes: int = LANES) -
 def measure(runs: Sequence[Run]) -> Result:
     """Simulate the commands of the first run with its car, for at most `LONGEST`."""
     told, car = runs[0].commands, drawn_car(runs[0].about)
-    driver = Replay(times=told["time_s"], throttle=told["throttle"], steering=told["steering"])
+    driver = replay(told)
     longest = min(float(told["time_s"][-1]), LONGEST)
     return _found(car, runs[0].path.name, driver, longest, longest, silent, LANES)
 

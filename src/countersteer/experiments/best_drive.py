@@ -97,7 +97,7 @@ def best(
 def replay(commands: Command) -> Replay:
     """A driver that gives the commands open loop."""
     times = KNOT * np.arange(len(commands.throttle))
-    return Replay(times=times, throttle=commands.throttle, steering=commands.steering)
+    return Replay(times=times, commands=commands)
 
 
 def judged(

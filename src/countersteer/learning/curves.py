@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from countersteer.runs.files import csv_text
-from countersteer.viewing.style import styled
+from countersteer.viewing.style import new_figure, styled
 from countersteer.writing import whole, write_whole
 
 Curves = Sequence[dict[str, float]]
@@ -22,18 +22,15 @@ def save(
     columns = list(curves[0])
     rows = [[told[name] for name in columns] for told in curves]
     write_whole(policy.with_suffix(".csv"), csv_text(columns, rows))
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     label, size = unit
     done = [told[along] / size for told in curves]
     with styled(), whole(policy.with_suffix(".png")) as part:
-        figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure, canvas = new_figure(9.0, 6.0)
+        figure.set_layout_engine("constrained")
         for ax, names in zip(figure.subplots(2, 2).flat, panels, strict=True):
             for name in names:
                 ax.plot(done, [told[name] for told in curves], label=name)
             ax.set_xlabel(label)
             ax.legend(fontsize=7)
         figure.suptitle(title)
-        figure.savefig(part, format="png", dpi=100)
+        canvas.print_png(str(part))

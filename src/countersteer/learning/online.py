@@ -9,13 +9,14 @@ Then the car takes the best action, or now and then a random one, which becomes 
 real-time dynamic programming. It needs no step size, as Q-learning does, and no learned model, as
 Dyna does: the paper's transitions come from a simulator too. Cells are not interpolated.
 
-Rewards are the paper's: time, road, and a prize at the goal, which is the end of each repeated part
-of the course. After a touch the car begins anew at the start, at rest.
+Rewards are those of `learning.tabular`: progress, a penalty for a touch, and on an open course a
+prize at the goal. After a touch, or the goal, the car begins anew at the start, at rest.
 
 Source: A. Barto, S. Bradtke and S. Singh, Learning to Act Using Real-Time Dynamic Programming,
 Artificial Intelligence 72, 1995.
 """
 
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -29,14 +30,13 @@ from countersteer.course.way import start_of
 from countersteer.drivers import tabular
 from countersteer.drivers.grid import Grid
 from countersteer.drivers.tabular import driven, frame_of, in_frame, motion_seen, moved
-from countersteer.learning.tabular import Job, Touching, touching
+from countersteer.learning.tabular import Job, Touching, goal_of, touching
 from countersteer.signals import Array, Command, Motion, Scalar
-from countersteer.task.reward import PAPER
+from countersteer.viewing.learners import Learners
 
 # What `learn online` takes: few cells, since a car visits them one by one.
 DIMENSIONS = ("place_m=0.3", "offset_m=0.3", "heading_deg=-90:90:30", "vx_mps=0:2.8:0.4",
               "yaw_rate_degps=-345:345:172.5")  # fmt: skip
-WEIGHTS = PAPER
 FIRST = 0.3  # part of the actions that are random at first
 TEST = 10.0  # s of a drive that tests the values, without random actions
 TESTS = 60  # in a learner's life
@@ -57,15 +57,7 @@ class Choices(NamedTuple):
 
     after: Going
     promised: Array  # reward, and the discounted value behind it
-    fails: Array
-
-
-class Curves(NamedTuple):
-    """How learners went: arrays (learners, TESTS)."""
-
-    driven: np.ndarray  # s, (TESTS,)
-    metres: np.ndarray  # that a test came, without random actions
-    cpu: np.ndarray  # s of CPU a learner, (TESTS,)
+    ends: Array  # it touches, or is at the goal
 
 
 class Online:
@@ -75,13 +67,13 @@ class Online:
         """Each learner drives for `seconds`."""
         self.job, self.frame = job, frame_of(job.course)
         self.touch: Touching = touching(job, self.frame)
+        self.goal = goal_of(job.course, self.frame)
         self.car = jax.tree.map(lambda leaf: np.float32(leaf), job.car)
         self.per_test = math.ceil(seconds / TESTS / job.decision)
-        self.fading = (
-            self.per_test * TESTS / 3
-        )  # decisions until random actions are 1/e as frequent
+        self.fading = self.per_test * TESTS / 3  # decisions until random ones are 1/e as frequent
         self._learn = jax.jit(jax.vmap(self._some, (0, 0, 0, 0, None)))
         self._test = jax.jit(jax.vmap(self._metres))
+        self._smooth = jax.jit(functools.partial(self._metres, smooth=True))
         self.start = self._at_start()
 
     def learn(
@@ -90,7 +82,7 @@ class Online:
         first: int,
         exploring: bool,
         report: Callable[[int], None] = lambda _: None,
-    ) -> tuple[np.ndarray, Curves]:
+    ) -> tuple[np.ndarray, Learners]:
         """Values (seeds, motions, poses) and curves. `report` is told how many tests are done."""
         table = self.job.table
         values = jnp.zeros((seeds, table.motion.size, table.pose.size), jnp.float32)
@@ -106,12 +98,11 @@ class Online:
             begun += time.process_time() - begun - seeds * cpu[-1]  # a test is no learning
             report(number + 1)
         driven = self.job.decision * self.per_test * np.arange(1, TESTS + 1)
-        return np.asarray(values), Curves(driven, np.stack(metres, axis=1), np.array(cpu))
+        return np.asarray(values), Learners(driven, np.stack(metres, axis=1), np.array(cpu))
 
-    def test(self, values: Array, smooth: bool = True) -> float:
-        """Metres that a car comes in `TEST` by values (motions, poses), up to a touch."""
-        run = jax.jit(self._metres, static_argnums=1)
-        return float(run(jnp.asarray(values), smooth))
+    def test(self, values: Array) -> float:
+        """Metres that a car comes in `TEST` by interpolated values (motions, poses)."""
+        return float(self._smooth(jnp.asarray(values)))
 
     def _at_start(self) -> Going:
         """At rest at the course's start."""
@@ -135,7 +126,7 @@ class Online:
             rare = chance * jnp.exp(-number / self.fading)
             action = jnp.where(jax.random.uniform(coin) < rare, any_one, best)
             after = jax.tree.map(lambda leaf: leaf[action], found.after)
-            again = found.fails[action]
+            again = found.ends[action]
             after = jax.tree.map(lambda a, b: jnp.where(again, a, b), self.start, after)
             return (after, values), None
 
@@ -145,13 +136,13 @@ class Online:
         return going, values
 
     def _metres(self, values: Array, smooth: bool = False) -> Scalar:
-        """Metres that a car comes by the values."""
+        """Metres that a car comes by the values, up to a touch or the goal."""
 
         def one(carry: tuple[Going, Scalar], _: None) -> tuple[tuple[Going, Scalar], None]:
             going, over = carry
             found = self._tried(going, values, smooth)
             best = jnp.argmax(found.promised)
-            over = over | found.fails[best]
+            over = over | found.ends[best]
             after = jax.tree.map(lambda leaf: leaf[best], found.after)
             return (jax.tree.map(lambda a, b: jnp.where(over, a, b), going, after), over), None
 
@@ -183,19 +174,13 @@ class Online:
                 worth = tabular.worth(job.table, values, seen, m)
             else:
                 worth = values[self._cell(after)]
-            gain = job.weights.time * job.decision + self._prize(going.place, after.place)
+            arrives = after.place >= self.goal
+            gain = job.weights.time * job.decision
             gain = gain + job.weights.progress * (after.place - going.place)
-            promised = jnp.where(fails, job.weights.road, gain + job.discount * worth)
-            return Choices(after, promised, fails)
+            ahead = jnp.where(arrives, job.weights.goal, gain + job.discount * worth)
+            return Choices(after, jnp.where(fails, job.weights.road, ahead), fails | arrives)
 
         return jax.vmap(one)(actions)
-
-    def _prize(self, place: Scalar, after: Scalar) -> Scalar:
-        """The prize of a part of the course that is passed."""
-        d = self.job.table.pose.dimensions[0]
-        whole = d.high - d.low if d.word == "place" and d.wraps else jnp.inf
-        passed = jnp.floor(after / whole) - jnp.floor(place / whole)
-        return self.job.weights.goal * passed
 
     def _cell(self, going: Going) -> tuple[Scalar, Scalar]:
         """The cell (motion, pose) around a car: its nearest point."""

@@ -48,13 +48,12 @@ from countersteer.planning.clearance import clearance_of
 from countersteer.reading.values import short
 from countersteer.signals import Array, Command, Scalar
 from countersteer.task.reward import Reward
+from countersteer.viewing.slices import Slice
 
-# What `learn tabular` takes: the smallest grid that was found to lap `box` (docs/tabular.md).
+# What `learn tabular` takes. It laps `box`; docs/tabular.md has a smaller one that does.
 DIMENSIONS = ("place_m=0.2", "offset_m=0.2", "heading_deg=-90:90:18",
               "vx_mps=0:2.8:0.7", "vy_mps=-1.2:1.2:0.6", "yaw_rate_degps=-345:345:115",
               "steering_deg=-28:28:28")  # fmt: skip
-THROTTLE = (0.0, 0.5, 1.0)
-STEERING = (-28.0, -14.0, 0.0, 14.0, 28.0)  # degrees
 WEIGHTS = Reward(time=0.0, road=-10.0, goal=10.0, progress=1.0)
 TERMS = ("time", "road", "goal", "progress")  # of the reward: those that a state tells
 SWEEPS = 20  # with a policy held, between two over all actions
@@ -75,12 +74,12 @@ class Job:
     car_name: str
     car: Car
     table: Table
-    throttle: tuple[float, ...] = THROTTLE
-    steering: tuple[float, ...] = tuple(math.radians(a) for a in STEERING)
-    decision: float = 0.12  # s
-    horizon: float = 2.0  # s: rewards so far ahead count 1/e
-    weights: Reward = WEIGHTS
-    margin: float = 0.03  # m from a wall that count as a touch
+    throttle: tuple[float, ...]
+    steering: tuple[float, ...]  # rad
+    decision: float  # s
+    horizon: float  # s: rewards so far ahead count 1/e
+    weights: Reward
+    margin: float  # m from a wall that count as a touch
 
     @property
     def actions(self) -> Command:
@@ -146,6 +145,10 @@ def _dimension(word: str, course: Course) -> Dimension:
         raise InputError(
             f"--dimensions {short(word)}: write {name}=STEP or {name}=LOW:HIGH:STEP"
         ) from None
+    if name == "place_m" and course.closed and len(numbers) == 3:
+        raise InputError(
+            f"--dimensions {short(word)}: a closed course has its own range: write place_m=STEP"
+        )
     step = numbers[-1]
     low, high = numbers[:2] if len(numbers) == 3 else _range(name, course)
     if not (high > low and step > 0):
@@ -173,6 +176,11 @@ def _range(name: str, course: Course) -> tuple[float, float]:
         return begin - 0.5, begin + _lap(course) + 0.5
     ends = course.walls.reshape(-1, 2)[:, 0 if name == "x_m" else 1]
     return float(ends.min()), float(ends.max())
+
+
+def goal_of(course: Course, frame: Frame) -> float:
+    """The place of the goal (m), which ends a drive on an open course; a closed one has no end."""
+    return math.inf if course.closed else start_of(course, frame.way) + _lap(course)
 
 
 def _lap(course: Course) -> float:
@@ -239,10 +247,16 @@ def poses_of(job: Job, frame: Frame, touch: Touching) -> Poses:
     if "place" in nodes:
         place = nodes["place"]
     else:
-        rows = slice(0, int(frame.way.last) + 1)
-        points = shapely.STRtree(shapely.points(frame.way.x[rows], frame.way.y[rows]))
-        place = SPACING * jnp.asarray(points.nearest(shapely.points(x, y)), jnp.float32)
+        place = SPACING * jnp.asarray(nearest_rows(frame, x, y), jnp.float32)
     return Poses(x, y, heading, place, jax.vmap(touch.at)(nodes))
+
+
+def nearest_rows(frame: Frame, x: Any, y: Any) -> np.ndarray:
+    """The rows of the way that are nearest to points."""
+    rows = slice(0, int(frame.way.last) + 1)
+    tree = shapely.STRtree(shapely.points(frame.way.x[rows], frame.way.y[rows]))
+    found: np.ndarray = tree.nearest(shapely.points(x, y))
+    return found
 
 
 def reactions(job: Job) -> Any:
@@ -279,7 +293,7 @@ def transitions(
     end = jax.tree.map(lambda leaf: leaf[:, -1], after)
     corners, weights = tabular.interpolation(motion_grid, tabular.motion_seen(end))
     by = np.stack([after.x, after.y, after.heading], axis=1)  # (M A, 3, SAMPLES)
-    goal = math.inf if job.course.closed else start_of(job.course, frame.way) + _lap(job.course)
+    goal = goal_of(job.course, frame)
 
     def one(by: Array) -> tuple[Array, Array, Array]:
         def of_pose(pose: Poses) -> tuple[Scalar, Array, Scalar]:
@@ -491,17 +505,6 @@ def learn(
     return Learned(solution, cost)
 
 
-class Slice(NamedTuple):
-    """Values and best actions over the course, for one motion along it: arrays (rows, columns)."""
-
-    name: str
-    x: np.ndarray  # m
-    y: np.ndarray
-    value: np.ndarray  # NaN where the car touches
-    throttle: np.ndarray
-    steering_deg: np.ndarray
-
-
 SHOWN = (0.5, 0.85)  # speeds of the slices, over the fastest of the grid
 
 
@@ -513,9 +516,7 @@ def slices(job: Job, solution: Solution) -> list[Slice]:
     x, y, heading = (
         np.asarray(part).reshape(shape) for part in jax.vmap(lambda at: frame.pose(at))(nodes)
     )
-    rows = slice(0, int(frame.way.last) + 1)
-    tree = shapely.STRtree(shapely.points(frame.way.x[rows], frame.way.y[rows]))
-    near = tree.nearest(shapely.points(x[..., 0].ravel(), y[..., 0].ravel())).reshape(shape[:2])
+    near = nearest_rows(frame, x[..., 0].ravel(), y[..., 0].ravel()).reshape(shape[:2])
     bearing = np.arctan2(frame.way.along_y[near], frame.way.along_x[near])
     off = np.abs(np.angle(np.exp(1j * (heading - np.asarray(bearing)[..., None]))))
     along = np.argmin(off, axis=-1)[..., None]  # of the headings, the one along the course
@@ -544,16 +545,16 @@ def slices(job: Job, solution: Solution) -> list[Slice]:
                 np.where(np.isnan(value), np.nan, np.degrees(actions.steering[best])),
             )
         )
-    return [turned(one, job.course, grid) for one in found]
+    return [turned(one, job.course, frame, grid) for one in found]
 
 
-def turned(one: Slice, course: Course, grid: Grid) -> Slice:
+def turned(one: Slice, course: Course, frame: Frame, grid: Grid) -> Slice:
     """The slice on the whole lap, of a grid that holds a repeated part of it."""
     count = repeats(course) if grid.dimensions[0].word == "place" else 1
     if count == 1:
         return one
-    ends = course.walls.reshape(-1, 2)
-    middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
+    rows = slice(0, int(frame.way.whole))
+    middle = float(np.mean(frame.way.x[rows])), float(np.mean(frame.way.y[rows]))
     angle = sum(turn.angle for turn in course.turns) / count
     xs, ys = [], []
     for i in range(count):

@@ -100,20 +100,19 @@ class Track(NamedTuple):
         return np.interp(time, self.time, values, left=math.nan, right=math.nan)
 
 
-def find_defects(run: Run) -> list[LogDefect]:
+def find_defects(run: Run, car: Car | None = None) -> list[LogDefect]:
     """Stretches of the run that a fit must leave out, sorted by start.
 
-    Raises `InputError` with file and time if the whole log is unusable.
+    `car` is as in `refuse`. Raises `InputError` with file and time if the whole log is unusable.
     """
-    refuse(run)
+    refuse(run, car)
     run, _ = repair(run)
     found = [*gaps(run), *missing(run), *released(run)]
     track = None
     if run.truth is not None:
         found += [*repeated_frames(run.truth), *jumps(run.truth), *false_yaw_rates(run.truth)]
-        found += backwards(run, run.truth)
         track = follow(run.truth)
-        found += collisions(run, track)
+        found += [*backwards(run, track), *collisions(run, track)]
     else:
         found += impacts(run)
     found += [*stuck_encoder(run, track), *stuck_gyroscope(run, track)]
@@ -160,7 +159,7 @@ def period(time: np.ndarray) -> float:
 
 
 def asked(run: Run, name: str, time: np.ndarray) -> np.ndarray:
-    """The throttle or steering command at these times; 0 before the first command."""
+    """A column of the commands at these times; 0 before the first command."""
     last = np.searchsorted(run.commands["time_s"], time + 1e-6, side="right") - 1
     return np.where(last >= 0, run.commands[name][np.maximum(last, 0)], 0.0)
 
@@ -310,9 +309,8 @@ def false_frames(time: np.ndarray, pose: np.ndarray, off_by: tuple[float, float]
     return np.any(off > np.array([[limit], [limit], [limit_yaw]]), axis=0)
 
 
-def backwards(run: Run, truth: Table) -> Iterator[LogDefect]:
+def backwards(run: Run, track: Track | None) -> Iterator[LogDefect]:
     """Stretches of `REVERSED` seconds in which a car that is driven forwards goes backwards."""
-    track = follow(truth)
     if track is None:
         return
     driven = (asked(run, drive_column(run.commands), track.time) > DRIVEN) & (track.vx < -APART)
@@ -764,7 +762,9 @@ def _refuse_turning(run: Run, car: Car) -> None:
             f"steering and wheelbase allow: in degrees? {DECLARE_DEGREES}"
         )
     # In a drift the front wheels point the other way. A car that hardly turns does not drift.
-    gentle = turns & (speed * np.abs(rate) < GENTLE)
+    # The encoder has no sign, so in reverse all turns would look turned round.
+    forward = asked(run, drive_column(run.commands), time) > 0
+    gentle = turns & forward & (speed * np.abs(rate) < GENTLE)
     found = _ratio(rate, expected, gentle)
     if found and found[0] > -COARSE and found[1] < -1 / COARSE:
         at = float(time[np.argmax(gentle)])

@@ -19,7 +19,8 @@ Check = Callable[[Any, str], object]  # of a value, with its file and key; raise
 FARTHEST, FASTEST = 1e6, 1e4  # m (also rad); m/s and rad/s
 LONGEST_TEXT = 1000  # characters
 # `wheels` is the mean of all four, as of a log that has each of them, or does not say.
-ENCODER_ON = ("shaft", "front-left", "front-right", "rear-left", "rear-right", "wheels")
+WHEELS = ("front-left", "front-right", "rear-left", "rear-right")
+ENCODER_ON = ("shaft", *WHEELS, "wheels")
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": math.pi / 180}
 VOLT_UNITS = {"V": 1.0, "mV": 1e-3}
 

@@ -34,7 +34,7 @@ class Run:
 
     path: Path
     about: dict[str, Any]  # run.toml
-    commands: Table  # time_s, throttle (negative in reverse), steering (rad)
+    commands: Table  # time_s, throttle or speed (negative in reverse), steering (rad)
     telemetry: Table | None
     truth: Table | None
     summary: dict[str, Any] = dataclasses.field(default_factory=dict)  # summary.json
@@ -86,7 +86,7 @@ def refuse_long(run: Run) -> None:
             first, last = float(table["time_s"][0]), float(table["time_s"][-1])
             advice = "convert milliseconds, or cut the log into pieces"
             if last - first <= min(LONGEST, SLOWEST_CLOCK * len(table)):
-                advice = f"subtract the {first:g} s at which it begins from all the log's tables"
+                advice = "'countersteer import run' moves the clock of all its tables to 0"
             raise InputError(
                 f"{run.path}/{name}.csv: goes on to {last:g} s, over {LONGEST:g} s: {advice}"
             )

@@ -11,7 +11,7 @@ from countersteer.car.car import Car
 from countersteer.car.files import car_text, library, load_car
 from countersteer.car.parameter import EDGE, changed
 from countersteer.errors import InputError
-from countersteer.runs.defects import LogDefect, find_defects, refuse, repair
+from countersteer.runs.defects import LogDefect, find_defects, repair
 from countersteer.runs.files import drive_column
 from countersteer.runs.run import Run
 from countersteer.text import toml_of
@@ -67,9 +67,8 @@ def read_logs(runs: Sequence[Run], cars: Mapping[str, Car], every: float, base: 
     clean, sensors, masks, words = [], [], [], []
     for run in runs:
         car = cars[surface_of(run, cars, base)]
-        refuse(run, car)
+        found = find_defects(run, car)
         mended, repairs = repair(run)
-        found = find_defects(mended)
         sensors.append(resolve(mended, car, fit.STEP))
         clean.append(sensors[-1].run)
         masks.append(found)

@@ -20,7 +20,7 @@ from countersteer.errors import InputError
 from countersteer.runs.declared import sensor_tables
 from countersteer.runs.defects import stretches
 from countersteer.runs.files import Table, drive_column
-from countersteer.runs.keys import ENCODER_ON
+from countersteer.runs.keys import WHEELS
 from countersteer.runs.run import Run, refuse_long
 from countersteer.signals import AnyCommand, Command, Motion, Scalar, SpeedCommand, Wheels
 from countersteer.world import planar, servo, speed_controller
@@ -173,7 +173,7 @@ def shares(on: str, car: Car) -> Wheels:
     if on == "wheels":
         return MEAN
     if on != "shaft":
-        return Wheels(*(float(on == place) for place in ENCODER_ON[1:5]))
+        return Wheels(*(float(on == place) for place in WHEELS))
     front = float(car.drivetrain.front_share) / 2
     return Wheels(front, front, 0.5 - front, 0.5 - front)
 
@@ -307,11 +307,10 @@ def why_no_window(run: Run, measured: Measured, horizon: float) -> str:
     """Why a run has no window of `horizon` seconds."""
     where = f"{run.path}: no window of {horizon:g} s: "
     if measured.vx is None and "wheel_speed_mps" not in find_references(measured):
-        there = "truth.csv" if run.truth is not None else "telemetry.csv"
         empty = run.telemetry is not None and "wheel_speed_mps" in run.telemetry
         cause = "is empty" if empty else "is missing"
         return f"{where}it has no speed signal: wheel_speed_mps {cause} in telemetry.csv, and " + (
-            "truth.csv holds no poses" if there == "truth.csv" else "there is no truth.csv"
+            "truth.csv holds no poses" if run.truth is not None else "there is no truth.csv"
         )
     time = run.commands["time_s"]
     if time[-1] - time[0] < horizon:
@@ -534,10 +533,7 @@ def _actuators(
         work = planar.Tick(car, no_walls, command, command, count, dt)
         state, work = planar.delay(state, work)
         wheels = state.motion.wheels if rim is None else spins(car, rim)
-        goal = Command(
-            speed_controller.goal_duty(car, work.asked, wheels),
-            servo.target(car.servo, work.asked.steering),
-        )
+        goal = speed_controller.goals(car, work.asked, wheels)
         return state._replace(motion=planar.follow(car, state.motion, goal, dt)), begin
 
     return jax.lax.scan(tick, state, (counts, commands, rims))

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from countersteer.task.judge import DRIFT, Outcome, Score
-from countersteer.viewing.style import styled
+from countersteer.viewing.style import MOST_RUNS, styled
 from countersteer.writing import whole
+
+LINES = ("-", "--", ":")
 
 
 def draw_evaluation(scores: Mapping[str, Score], title: str, path: Path) -> None:
@@ -24,12 +26,13 @@ def draw_evaluation(scores: Mapping[str, Score], title: str, path: Path) -> None
 
     with styled(), whole(path) as part:
         figure, (errors, slips, laps) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
-        for name, score in scores.items():
+        for i, (name, score) in enumerate(scores.items()):
             won, turns = score.outcome == Outcome.REACHED.code, score.turns
             if not np.any(won):
                 continue
             counted = won[:, None] & np.isfinite(turns.begin)
-            drawn = {"histtype": "step", "linewidth": 1.5, "label": name}
+            dashes = LINES[i // MOST_RUNS % len(LINES)]  # the colours begin again
+            drawn = {"histtype": "step", "linewidth": 1.5, "label": name, "linestyle": dashes}
             for axes, values, bins in (
                 (errors, np.degrees(turns.error[counted]), np.linspace(-10, 10, 41)),
                 (slips, np.degrees(turns.peak_sideslip[counted]), np.linspace(0, 70, 36)),

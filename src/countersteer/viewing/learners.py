@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,27 +22,16 @@ COLOURS = {"exploring": STEERED, "greedy": SIMULATED}
 NAMES = {"exploring": "online, with random actions", "greedy": "online, without"}
 
 
-class Curves(Protocol):
-    """Of learners of one kind."""
+class Learners(NamedTuple):
+    """How learners of one kind went: arrays (learners, tests)."""
 
-    @property
-    def driven(self) -> np.ndarray:
-        """Seconds (tests,)."""
-        ...
-
-    @property
-    def metres(self) -> np.ndarray:
-        """Of each test (learners, tests)."""
-        ...
-
-    @property
-    def cpu(self) -> np.ndarray:
-        """Seconds a learner (tests,)."""
-        ...
+    driven: np.ndarray  # s, (tests,)
+    metres: np.ndarray  # that a test came, without random actions
+    cpu: np.ndarray  # s of CPU a learner, (tests,)
 
 
 def draw_learners(
-    found: Mapping[str, Curves], sweeps: Sequence[tuple[float, float]], title: str, file: Path
+    found: Mapping[str, Learners], sweeps: Sequence[tuple[float, float]], title: str, file: Path
 ) -> None:
     """Draw each learner thin, the median thick; `sweeps` are (CPU seconds, metres) of the table."""
     figure, canvas = new_figure(12.0, 4.6)

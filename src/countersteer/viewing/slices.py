@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,38 +16,15 @@ WALL = light("wall")
 HEAD = 0.85  # inches, above the slices
 
 
-class Slice(Protocol):
-    """Arrays (rows, columns) over the course."""
+class Slice(NamedTuple):
+    """Values and best actions over the course, for one motion along it: arrays (rows, columns)."""
 
-    @property
-    def name(self) -> str:
-        """The motion that they are for."""
-        ...
-
-    @property
-    def x(self) -> np.ndarray:
-        """Metres."""
-        ...
-
-    @property
-    def y(self) -> np.ndarray:
-        """Metres."""
-        ...
-
-    @property
-    def value(self) -> np.ndarray:
-        """NaN where there is none."""
-        ...
-
-    @property
-    def throttle(self) -> np.ndarray:
-        """Of the best action."""
-        ...
-
-    @property
-    def steering_deg(self) -> np.ndarray:
-        """Of the best action."""
-        ...
+    name: str
+    x: np.ndarray  # m
+    y: np.ndarray
+    value: np.ndarray  # NaN where the car touches
+    throttle: np.ndarray
+    steering_deg: np.ndarray
 
 
 def draw_slices(

@@ -120,7 +120,7 @@ def known_rows(run: Run) -> Table:
 
 def is_simulated(run: Run) -> bool:
     """Whether the run tells the whole motion, down to each wheel."""
-    return run.truth is not None and {*POSE, *COLUMNS} <= run.truth.keys()
+    return bool(run.truth is not None and len(run.truth) and {*POSE, *COLUMNS} <= run.truth.keys())
 
 
 def motion_of(run: Run, car: Car) -> dict[str, np.ndarray]:
@@ -232,14 +232,13 @@ def events(run: Run) -> list[dict[str, Any]]:
         came = run.commands["time_s"]
         for i in np.nonzero(np.diff(came) > LATE * period)[0]:
             found.append(_event("lost", "command lost", came[i] + period, came[i + 1]))
-    armed = (run.telemetry if run.telemetry is not None else Table()).get("armed")
-    if armed is not None and run.telemetry is not None:
-        from countersteer.runs.defects import stretches  # it imports SciPy as well
+    if run.telemetry is not None and "armed" in run.telemetry:
+        from countersteer.runs.defects import released  # it imports SciPy as well
 
-        time = run.telemetry["time_s"]
-        for first, last in stretches(armed < 0.5):
-            end = time[min(last + 1, len(time) - 1)]
-            found.append(_event("released", "dead-man switch released", time[first], end))
+        found += [
+            _event("released", "dead-man switch released", one.start, one.end)
+            for one in released(run)
+        ]
     return found
 
 

@@ -1,8 +1,8 @@
-"""The viewer: the modules of JavaScript in `viewer/`, which report and live page share.
+"""The viewer: the modules of JavaScript in `viewer/`, of the report.
 
-They are plain ES modules, so a server hands them out as they are. A page that stands alone has them
-as one script. Each top-level name is unique among them, so their texts can simply follow each
-other.
+They are plain ES modules, so a server can hand them out one by one (`module`). A page that stands
+alone has them as one script. Each top-level name is unique among them, so their texts can simply
+follow each other.
 """
 
 import importlib.resources

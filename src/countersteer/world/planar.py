@@ -172,10 +172,7 @@ def _delayed(line: Array, now: Scalar, time: Scalar, tick: Tick) -> tuple[Array,
 def move(state: State, tick: Tick) -> tuple[State, Tick]:
     """The motion over the tick: coefficients at its middle, then two implicit stages."""
     car, h, start = tick.car, tick.dt, state.motion
-    goal = Command(
-        speed_controller.goal_duty(car, tick.asked, start.wheels),
-        servo.target(car.servo, tick.asked.steering),
-    )
+    goal = speed_controller.goals(car, tick.asked, start.wheels)
     velocity = Vector(start.vx, start.vy, start.yaw_rate)
     friction = under_wheels(tick.floor, car.body, start, h / 2)
     at_start = grip(car, start, friction)

@@ -44,10 +44,7 @@ def settled(car: Car, commands: AnyCommand, wheels: Wheels, dt: float) -> tuple[
     They begin at the steady state of the first command. `wheels` (ticks,) are the spins that a
     speed controller measures; throttles do not need them.
     """
-    goals = Command(
-        speed_controller.goal_duty(car, commands, wheels),
-        servo.target(car.servo, commands.steering),
-    )
+    goals = speed_controller.goals(car, commands, wheels)
 
     def settle(at: tuple[Scalar, Scalar], goal: Command) -> tuple[tuple[Scalar, Scalar], None]:
         angle, duty = at

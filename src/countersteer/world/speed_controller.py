@@ -4,7 +4,12 @@ import jax.numpy as jnp
 
 from countersteer.car.car import Car
 from countersteer.signals import AnyCommand, Command, Scalar, Wheels
-from countersteer.world import drivetrain, motor
+from countersteer.world import drivetrain, motor, servo
+
+
+def goals(car: Car, asked: AnyCommand, wheels: Wheels) -> Command:
+    """What motor and servo approach under a command: duty, and angle of the front wheels (rad)."""
+    return Command(goal_duty(car, asked, wheels), servo.target(car.servo, asked.steering))
 
 
 def goal_duty(car: Car, command: AnyCommand, wheels: Wheels) -> Scalar:

@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from countersteer.errors import InputError
+from countersteer.runs.declared import moved_to_centre
 from countersteer.runs.defects import SLACK, SLACK_YAW
 from countersteer.runs.files import LATEST, Table, read_table, require
-from countersteer.runs.importers.imported import Imported, at_centre, write_run
+from countersteer.runs.importers.imported import Imported, write_run
 
 FULL_LOCK = 25.0  # degrees, nominal angle of the front wheels at a steering of 1
 
@@ -176,8 +177,8 @@ def _captured(table: Table) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     repeated[1:] = np.all(np.diff(pose) == 0, axis=0) | (np.diff(time) == 0)
     possible = _possible(time, x, y, yaw, ~repeated)
     heading = np.unwrap(yaw[possible])
-    at = at_centre(x[possible], y[possible], heading, (POINT_X, POINT_Y, YAW_ERROR))
-    truth = dict(zip(("time_s", "x_m", "y_m", "heading_rad"), (time[possible], *at), strict=True))
+    seen = Table(time_s=time[possible], x_m=x[possible], y_m=y[possible], heading_rad=heading)
+    truth = dict(moved_to_centre(seen, POINT_X, POINT_Y, -YAW_ERROR))
     wraps = np.sum(np.abs(np.diff(yaw[possible])) > math.pi)
     return truth, {
         "frames_repeated": int(np.sum(repeated)),

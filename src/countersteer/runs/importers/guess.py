@@ -16,7 +16,7 @@ from countersteer.errors import InputError
 from countersteer.reading.values import short
 from countersteer.runs.importers.mapping import LONGEST
 from countersteer.runs.importers.tables import TextTable
-from countersteer.runs.importers.units import SIGNALS, UNITS
+from countersteer.runs.importers.units import SIGNALS, UNITS, Unit
 
 # Words of a column's name for each signal, the surest first, and words that speak against it.
 WORDS = {
@@ -57,8 +57,8 @@ UNIT_WORDS = {
     "m/s": r"m.?(p|/).?s$|m/s\b|mps",
     "erpm": r"erpm",
     "rpm": r"rpm",
-    "deg/s": r"deg.?(p|/|_per_).?s|dps",
-    "rad/s": r"rad.?(p|/|_per_).?s|rps",
+    "deg/s": r"deg.?(p|/|_per_).?s|(?<!ra)dps",
+    "rad/s": r"rad.?(p|/|_per_).?s",
     "deg": r"deg|°",
     "rad": r"rad",
     "ns": r"_ns$|\(ns\)|nano|nsec",
@@ -311,18 +311,25 @@ def _signs(table: TextTable, guesses: dict[str, Guess]) -> list[str]:
     ]
 
 
+FILL_IN = {  # numbers of the mapping that only the owner knows
+    "full_lock_deg": "full_lock_deg = 25  # angle of the front wheels at full steering",
+    "wheel_radius_m": "wheel_radius_m = 0.05",
+    "gear_ratio": "gear_ratio = 10.0  # motor turns per wheel turn; 1 if it is the wheel's rpm",
+    "pole_pairs": "pole_pairs = 2",
+}
+
+
 def _text(log: Path, table: TextTable, guesses: dict[str, Guess], doubts: list[str]) -> str:
     """The mapping as TOML with comments."""
-    units = {str(guess.entry.get("unit")) for guess in guesses.values()}
-    steering = str(guesses["steering"].entry["unit"]) if "steering" in guesses else "rad"
+    needs = {
+        name
+        for signal, guess in guesses.items()
+        for name in UNITS.get(SIGNALS[signal].dimension, {})
+        .get(str(guess.entry.get("unit")), Unit())
+        .needs
+    }
     lines = [f"# A first mapping of {short(log.name)}, guessed. Read each line, and every doubt."]
-    if steering not in ("rad", "deg"):
-        lines.append("full_lock_deg = 25  # angle of the front wheels at full steering")
-    if units & {"rpm", "erpm"}:
-        lines.append("wheel_radius_m = 0.05")
-        lines.append("gear_ratio = 10.0  # motor turns per wheel turn; 1 if it is the wheel's rpm")
-    if "erpm" in units:
-        lines.append("pole_pairs = 2")
+    lines += [line for name, line in FILL_IN.items() if name in needs]
     for signal, guess in guesses.items():
         column = {} if "columns" in guess.entry else {"column": guess.column}
         pairs = {**column, **guess.entry}

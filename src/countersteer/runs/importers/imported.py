@@ -8,21 +8,17 @@ import numpy as np
 from countersteer.runs.files import COMMANDS, SPEED_COMMANDS
 from countersteer.runs.recorder import Recorder, whole_folder
 
+# Where the encoder of a log sits and what it counts over, unless the log says so: not what the
+# sensors of the car that is compared are. Lag and step are then 0 or what the log tells.
+ENCODER = {"on": "wheels", "over_s": 0.0}
+
 Columns = dict[str, np.ndarray]  # by the name in the file; `time_s` is the first
 
 
-def at_centre(
-    x: np.ndarray, y: np.ndarray, heading: np.ndarray, point: tuple[float, float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pose of the centre of mass from that of a captured point.
-
-    `point` is its place in the car's axes, forward and left of the centre of mass (m), and the
-    angle to add to the captured heading (rad).
-    """
-    ahead, left, error = point
-    true = heading + error
-    cosine, sine = np.cos(true), np.sin(true)
-    return x - cosine * ahead + sine * left, y - sine * ahead - cosine * left, true
+def with_encoder(about: dict[str, Any]) -> dict[str, Any]:
+    """The content of a `run.toml` that says where the encoder sits (`ENCODER`)."""
+    sensors = about.get("sensors", {})
+    return about | {"sensors": sensors | {"encoder": ENCODER | sensors.get("encoder", {})}}
 
 
 class Imported(NamedTuple):

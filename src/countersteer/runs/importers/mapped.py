@@ -10,7 +10,7 @@ import numpy as np
 from countersteer.errors import InputError
 from countersteer.reading.values import shown
 from countersteer.runs.files import FASTEST, LARGEST, LARGEST_STEERING, LATEST, LONGEST
-from countersteer.runs.importers.imported import Columns, Imported, at_centre, write_run
+from countersteer.runs.importers.imported import Columns, Imported, with_encoder, write_run
 from countersteer.runs.importers.mapping import Entry, Recipe, column_missing
 from countersteer.runs.importers.units import TELEMETRY, TRUTH, factor_of
 
@@ -90,7 +90,7 @@ def converted(log: Path, format_name: str, recipe: Recipe, find: Find) -> Import
             )
     time, motor, steering = _commands(found, drive)
     telemetry = _telemetry(found)
-    truth = _truth(found, recipe)
+    truth = _truth(found, recipe.where)
     if telemetry is None and truth is None:
         raise InputError(f"{log}: no sensor and no motion capture: name wheel_speed, gyro or x")
     doubts = _doubts(time, motor, steering, found)
@@ -103,10 +103,7 @@ def converted(log: Path, format_name: str, recipe: Recipe, find: Find) -> Import
         "doubts": doubts,
     }
     if "wheel_speed" in found:
-        # Not where the encoder of the car sits that is compared, unless the mapping says so.
-        sensors = about.get("sensors", {})
-        encoder = {"on": "wheels", **sensors.get("encoder", {})}
-        about["sensors"] = {**sensors, "encoder": encoder}
+        about = with_encoder(about)
     rows = max(len(series.time) for series in found.values())
     return Imported(about, rows, time, motor, steering, telemetry, truth, drive == "speed")
 
@@ -240,23 +237,25 @@ def _telemetry(found: dict[str, Series]) -> Columns | None:
     return columns
 
 
-def _truth(found: dict[str, Series], recipe: Recipe) -> Columns | None:
-    """Motion capture at the centre of mass, where the mapping names a whole pose."""
+def _truth(found: dict[str, Series], where: str) -> Columns | None:
+    """Motion capture as it is, where the mapping names a whole pose.
+
+    It is moved to the centre of mass where the run is read, by its `[sensors.capture]`.
+    """
     there = [name for name in TRUTH if name in found]
     if not there:
         return None
     missing = [name for name in ("x", "y", "heading") if name not in found]
     if missing:
-        raise InputError(f"{recipe.where}: {there[0]} needs {', '.join(missing)} too: a whole pose")
+        raise InputError(f"{where}: {there[0]} needs {', '.join(missing)} too: a whole pose")
     time = found["x"].time
     for name in there:
         time = time[np.isin(time, found[name].time)]
     if not len(time):
-        raise InputError(f"{recipe.where}: {', '.join(there)} never come at one time")
+        raise InputError(f"{where}: {', '.join(there)} never come at one time")
     at = {n: found[n].value[np.searchsorted(found[n].time, time)] for n in there}
-    pose = at_centre(at["x"], at["y"], np.unwrap(at["heading"]), recipe.point)
-    columns = dict(zip(("time_s", "x_m", "y_m", "heading_rad"), (time, *pose), strict=True))
-    return columns | {TRUTH[n].column: at[n] for n in ("vx", "vy", "yaw_rate") if n in at}
+    at["heading"] = np.unwrap(at["heading"])
+    return {"time_s": time} | {TRUTH[name].column: at[name] for name in TRUTH if name in at}
 
 
 def _doubts(
@@ -279,7 +278,7 @@ def _doubts(
         forward = drive > 0
         if "wheel_speed" in found:
             speed = found["wheel_speed"]
-            forward = np.interp(time, speed.time, speed.value) > TURNS
+            forward &= np.interp(time, speed.time, speed.value) > TURNS
         turning = forward & (np.abs(steering) > TURNS) & (np.abs(rate) > TURNS)
         if np.sum(turning) > 10:
             same = float(np.mean(np.sign(steering[turning]) == np.sign(rate[turning])))

@@ -38,7 +38,6 @@ NUMBERS = {  # numbers of the whole mapping, with their ranges
     "pole_pairs": (1.0, 100.0),
 }
 TABLES = ("car_name", "battery_charge", "sensors")  # go to `run.toml`
-POINT = {"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0), "heading_deg": (-360.0, 360.0)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +75,6 @@ class Recipe:
     entries: Mapping[str, tuple[Entry, ...]]
     optional: frozenset[str]  # signals that a log may lack
     numbers: dict[str, float]
-    point: tuple[float, float, float]  # captured point from the centre of mass, m, and yaw error
     about: dict[str, Any]  # goes to `run.toml`
 
     @property
@@ -104,7 +102,7 @@ def read_mapping(path: Path | None, built_in: str | None = None) -> Recipe:
 
 def recipe_of(tables: Mapping[str, Any], where: str) -> Recipe:
     """The mapping of a file's tables. Raises `InputError`."""
-    known = {*SIGNALS, *NUMBERS, *TABLES, "capture_point"}
+    known = {*SIGNALS, *NUMBERS, *TABLES}
     for key in tables:
         if key not in known:
             raise unknown_key(where, key, dict.fromkeys(known))
@@ -119,6 +117,9 @@ def recipe_of(tables: Mapping[str, Any], where: str) -> Recipe:
     }
     about = {key: tables[key] for key in TABLES if key in tables}
     ABOUT(about, where, ": ")
+    for sensor in ("gyroscope", "voltmeter"):  # else the unit would count twice
+        if "unit" in about.get("sensors", {}).get(sensor, {}):
+            raise InputError(f"{where}: sensors.{sensor}.unit: give the signal its unit instead")
     entries = {}
     for signal in SIGNALS:
         if signal in tables:
@@ -128,22 +129,7 @@ def recipe_of(tables: Mapping[str, Any], where: str) -> Recipe:
             entries[signal] = tuple(
                 _entry(signal, entry, f"{where}: {signal}", numbers) for entry in given
             )
-    return Recipe(where, entries, frozenset(), numbers, _point(tables, where), about)
-
-
-def _point(tables: Mapping[str, Any], where: str) -> tuple[float, float, float]:
-    """The captured point; 0 where nothing is given."""
-    given = tables.get("capture_point", {})
-    if not isinstance(given, dict):
-        raise InputError(f"{where}: capture_point must be a table such as {{ x_m = 0.02 }}")
-    for key in given:
-        if key not in POINT:
-            raise unknown_key(f"{where}: capture_point", key, POINT)
-    x, y, heading = (
-        values.number(given.get(key, 0.0), f"{where}: capture_point.{key}", *bounds)
-        for key, bounds in POINT.items()
-    )
-    return x, y, math.radians(heading)
+    return Recipe(where, entries, frozenset(), numbers, about)
 
 
 def _entry(signal: str, table: Any, where: str, numbers: Mapping[str, float]) -> Entry:

@@ -19,7 +19,8 @@ from countersteer.errors import InputError
 from countersteer.reading.content import read_text, reading
 from countersteer.reading.documents import LARGEST_YAML, yaml_mapping
 from countersteer.reading.values import short, shown
-from countersteer.runs.importers.mapped import Find, import_mapped
+from countersteer.runs.importers.imported import write_run
+from countersteer.runs.importers.mapped import Find, converted
 from countersteer.runs.importers.mapping import Recipe, read_mapping
 from countersteer.runs.importers.messages import Types, WrongMessageError, bounded, numbers_of
 from countersteer.runs.importers.tables import RecordTable
@@ -67,7 +68,8 @@ def import_rosbag(log: Path, out: Path, mapping: Path | None) -> dict[str, Any]:
     with reading(log):
         check_files(log)
         with opened(log) as bag:
-            return import_mapped(log, out, "rosbag", recipe, tables_of(bag, log, recipe))
+            found = converted(log, "rosbag", recipe, tables_of(bag, log, recipe))
+    return write_run(log, out, found)
 
 
 def check_files(log: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from countersteer.errors import InputError
 from countersteer.reading.content import reading
 from countersteer.runs.files import Table, read_commands, read_measurements
-from countersteer.runs.importers.imported import Imported, write_run
+from countersteer.runs.importers.imported import Imported, with_encoder, write_run
 from countersteer.runs.run import read_about
 
 POSE = ("time_s", "x_m", "y_m", "heading_rad")
@@ -41,6 +41,8 @@ def import_run(log: Path, out: Path) -> dict[str, Any]:
         begin = min(float(table["time_s"][0]) for table in tables)
         _move(log, tables, begin)
     about = {"log_format": "run", **about, "repairs": {"clock_moved_s": begin}}
+    if telemetry is not None and "wheel_speed_mps" in telemetry:
+        about = with_encoder(about)
     by_speed = "speed" in commands
     drive = commands["speed" if by_speed else "throttle"]
     rows = max(map(len, tables))

@@ -3,6 +3,9 @@
 import math
 from typing import NamedTuple
 
+from countersteer.car.car import GRAVITY
+from countersteer.runs.keys import GYRO_UNITS, VOLT_UNITS
+
 TURN = 2 * math.pi
 
 
@@ -76,10 +79,10 @@ UNITS: dict[str, dict[str, Unit]] = {
         "rpm": Unit(TURN / 60, needs=("wheel_radius_m", "gear_ratio")),  # of the motor
         "erpm": Unit(TURN / 60, needs=("wheel_radius_m", "gear_ratio", "pole_pairs")),
     },
-    "rate": {"rad/s": Unit(), "deg/s": Unit(TURN / 360)},
-    "acceleration": {"m/s2": Unit(), "g": Unit(9.81)},
+    "rate": {name: Unit(factor) for name, factor in GYRO_UNITS.items()},
+    "acceleration": {"m/s2": Unit(), "g": Unit(GRAVITY)},
     "length": {"m": Unit(), "cm": Unit(0.01), "mm": Unit(0.001)},
-    "voltage": {"V": Unit(), "mV": Unit(0.001)},
+    "voltage": {name: Unit(factor) for name, factor in VOLT_UNITS.items()},
     "count": {"counts": Unit()},
 }
 

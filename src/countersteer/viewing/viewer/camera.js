@@ -54,8 +54,7 @@ export class ChaseCamera {
 }
 
 /**
- * What the viewer asks of the camera: `follow` the car, the whole `course`, or `chase` it. Each
- * keeps its own zoom and shift until it is reset.
+ * What the viewer asks of the camera: `follow` the car, the whole `course`, or `chase` it.
  */
 export class CameraRig {
   constructor(mode = "follow") {
@@ -63,9 +62,10 @@ export class CameraRig {
     this.reset();
   }
 
+  /** Show this, without zoom and shift. */
   choose(mode) {
-    if (mode === this.mode) this.reset();
     this.mode = mode;
+    this.reset();
   }
 
   reset() { Object.assign(this, { zoom: 1, x: 0, y: 0, yaw: 0, pitch: 0 }); }

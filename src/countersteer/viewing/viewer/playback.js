@@ -21,7 +21,7 @@ export class Playback {
 
   play(playing) {
     this.playing = playing;
-    if (playing && this.t >= this.end) this.t = this.begin;
+    if (playing && this.t >= this.end) this.goTo(this.begin);
     this.redraw();
   }
 

@@ -148,7 +148,7 @@ document.querySelectorAll(".chip").forEach((chip) => chip.addEventListener("clic
   layers[chip.value] = !layers[chip.value];
   showChoices();
 }));
-onChoice(part("camera"), (mode) => { stage.rig.choose(mode); stage.rig.reset(); });
+onChoice(part("camera"), (mode) => stage.rig.choose(mode));
 onChoice(part("zoom"), (way) => zoomBy(way === "in" ? 1.25 : 0.8));
 onChoice(part("speed"), (speed) => { clock.speed = Number(speed); });
 onChoice(part("axis"), (axis) => align(axis, alignment.differences));

@@ -53,7 +53,8 @@ export class Stage {
     c.clearRect(0, 0, size.width, size.height);
     if (!hasPath(drive)) return;
     const margin = { above: size.head, below: size.foot + 18 };
-    const camera = rig.camera(moment, this.bounds, drive.car, size, margin, chased(drive, moment));
+    const chase = rig.mode === "chase" ? chased(drive, moment) : null;
+    const camera = rig.camera(moment, this.bounds, drive.car, size, margin, chase);
     const pen = new Pen(c, camera);
     drawGrid(pen, theme, size, moment, drive.car);
     this.drives.forEach((one, k) => {
