@@ -210,8 +210,8 @@ def any_window(shots: Shots) -> np.ndarray:
 
 STAGES = {
     "longitudinal": Stage(SPEEDS, straight),
-    "steering": Stage((*STEERING, *STIFFNESS), steers),
-    "handling": Stage((*HANDLING, *TIRES[:4]), steered),
+    "steering": Stage((*STEERING_MAP, *STEERING[5:], *STIFFNESS), steers),
+    "handling": Stage((*STEERING[2:4], *HANDLING, *TIRES[:4]), steered),
     "drift": Stage((*HANDLING, *TIRES), slides),
     "all": Stage(PARAMETERS, any_window),
 }
@@ -662,16 +662,16 @@ def fit(
             total += found.evaluations
             map_told = [one for one in found.fitted if one.path in STEERING_MAP]
             cars, current = (
-                {key: with_map(car, found.cars[key]) for key, car in some.items()}
+                {key: with_steering(car, found.cars[key]) for key, car in some.items()}
                 for some in (cars, current)
             )
     result = believed(cars, current, part, free, report, charge, total)
     return result._replace(fitted=map_told + result.fitted)
 
 
-def with_map(car: Car, other: Car) -> Car:
-    """The car with the `STEERING_MAP` of another."""
-    for path in STEERING_MAP:
+def with_steering(car: Car, other: Car) -> Car:
+    """The car with the steady steering of another."""
+    for path in STEERING[:5]:
         car = changed(car, path, np.float64(value_of(other, path)))
     return car
 
