@@ -1,4 +1,4 @@
-"""How true the cars are: persistence, the published models and ours on every log of `../shared/data`.
+"""How true cars are: persistence, published models and ours on every log of `../shared/data`.
 
 `python -m studies.how_true PAGE [--data FOLDER] [--car NAME=FILE.toml ...]` writes the page and its
 pictures, and prints the table. NAME is the car that a log's importer names; FILE is judged in its
@@ -26,7 +26,6 @@ from countersteer.text import read_toml
 from countersteer.tuning import fit
 from countersteer.tuning.compare import HORIZON, Window, changes, compare, simulation_of
 from countersteer.tuning.windows import asked
-from countersteer.writing import write_whole
 from studies.published import Dart, Eth, Model, Velocity, predict
 
 NOTHING, PUBLISHED, OURS = "nothing changes", "published", "ours"

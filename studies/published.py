@@ -181,7 +181,7 @@ def magic(slip: Array, stiffness: float, shape: float, peak: float) -> Array:
 
 
 def slip_angle(along: Array, across: Array) -> Array:
-    """DART's slip angle (rad) of a wheel. Below 1 m/s its speed is raised, so that it stays small."""
+    """DART's slip angle (rad) of a wheel, whose speed counts for more below 1 m/s."""
     return np.arctan2(across, along + np.exp(-3 * along**2))
 
 

@@ -12,12 +12,13 @@ windows (`agreeing_charge`). The errors with a full battery are given too.
 
 A steady drift is predicted well by persistence, the prediction that nothing changes. So the same
 errors are given for `persistence`. All errors are repeated for windows in which something changes
-(`transient`), and for windows in which the car drives forward and slides (`sliding`).
+(`transient`), for the others (`steady`), and for windows in which the car drives forward and slides
+(`sliding`).
 """
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -28,7 +29,7 @@ from countersteer.car.car import Car
 from countersteer.errors import InputError
 from countersteer.runs import defects
 from countersteer.runs.run import Run
-from countersteer.tuning import fit
+from countersteer.tuning import belief, fit
 from countersteer.tuning.log_sensors import LogSensors, resolve
 from countersteer.tuning.windows import (
     CHANGES,
@@ -36,6 +37,7 @@ from countersteer.tuning.windows import (
     MEAN,
     QUANTITIES,
     SLOWEST,
+    VELOCITY,
     Measured,
     Reference,
     find_references,
@@ -83,7 +85,8 @@ def compare(
     servo follows the car's own law. The battery has the charge of `run.toml` or of the voltmeter,
     or else the one that agrees best; then `as_if_full` has the errors with a full battery.
 
-    `sensors` has what the log tells of its sensors, and `warnings` a line for each doubt.
+    `sensors` has what the log tells of its sensors. `warnings` has a line for each reason not to
+    believe the car on this log (`belief`), and for each doubt about the log itself.
     """
     simulation, sensors, repairs = simulation_of(run, car, horizon, dt)
     run, commands = simulation.run, simulation.run.commands
@@ -101,6 +104,7 @@ def compare(
         charge = agreeing_charge(run, simulation.car, simulation.measured, dt)
         windows, kept = simulation.windows(charge)
     lively = [window for window in windows if changes(window)]
+    steady = [window for window in windows if not changes(window)]
     sliding = [window for window in windows if slides(window)]
     result = {
         "windows": len(windows),
@@ -110,11 +114,14 @@ def compare(
         "battery_from": sensors.charge_from or "fit",
         **scores(windows),
         **as_if_full,
+        "steady": {"windows": len(steady), **scores(steady)},
         "transient": {"windows": len(lively), **scores(lively)},
         "sliding": {"windows": len(sliding), **scores(sliding)},
+        "spins": belief.spin_count(motions(windows)),
         "sensors": sensors.as_json(),
-        "warnings": [*repairs, *sensors.warnings],
     }
+    doubts = belief.of_comparison(result, yaw_rates(windows))
+    result["warnings"] = [*doubts, *repairs, *sensors.warnings]
     series_of_all = {
         "title": run.path.name,
         "result": result,
@@ -338,6 +345,23 @@ def slides(window: Window) -> bool:
     both = (window["vx_mps"], window["vy_mps"])
     vx, vy = (np.append(one.unchanged[:1], one.measured) for one in both)
     return bool(np.all(vx > 0) and np.any(np.arctan2(np.abs(vy), vx) >= SLIDE))
+
+
+def motions(windows: Iterable[Window]) -> Iterator[tuple[belief.Motion, belief.Motion]]:
+    """Measured and simulated motion of the body in the windows that have it whole."""
+    for window in windows:
+        if all(name in window for name in VELOCITY):
+            vx, vy, yaw_rate = (window[name] for name in VELOCITY)
+            yield (
+                (vx.measured, vy.measured, yaw_rate.measured),
+                (vx.simulated, vy.simulated, yaw_rate.simulated),
+            )
+
+
+def yaw_rates(windows: Iterable[Window]) -> np.ndarray:
+    """The yaw rate (rad/s) as measured at the ends of the windows that have it."""
+    name = "yaw_rate_radps"
+    return np.array([window[name].measured[-1] for window in windows if name in window])
 
 
 def scores(windows: Iterable[Window]) -> dict[str, Any]:
