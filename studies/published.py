@@ -140,13 +140,11 @@ class Eth:
     drag: float = 1.734  # N s/m
     front: tuple[float, float, float] = (1.90, 1.54, 0.597)  # B, C, D
     rear: tuple[float, float, float] = (6.29, 1.19, 0.427)
-    delay: float = 0.0  # s
     settles: float = 1 / 90  # s, in which the rolling car follows its wheels
 
-    def inputs(self, throttle: Array, steering: Array, dt: float) -> tuple[Array, Array]:
-        """Both commands, late by `delay`."""
-        late = round(self.delay / dt)
-        return tuple(np.pad(one, (late, 0))[: len(one)] for one in (throttle, steering))
+    def inputs(self, throttle: Array, steering: Array, _: float) -> tuple[Array, Array]:
+        """Both commands as they are: the model has neither lag nor delay."""
+        return throttle, steering
 
     def rates(self, now: Velocity, drive: Array, steering: Array) -> Velocity:
         """See the module's equations."""
