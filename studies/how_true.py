@@ -46,7 +46,8 @@ from countersteer.viewing.style import (
     light,
     new_figure,
 )
-from countersteer.writing import whole, write_whole
+from countersteer.writing import whole as written
+from countersteer.writing import write_whole
 from studies.published import Dart, Eth, Model, Velocity, predict
 
 NOTHING, PUBLISHED, OURS = "nothing changes", "published", "ours"
@@ -114,6 +115,8 @@ SOURCES = (
 
 # States one second after a like start differ so much in the log itself (the data's README).
 REPEATABLE = {"drift_tape_and_tiles": (0.027, 0.022, 0.105)}
+
+STEPS = "throttle_steps_rubber_floor"  # also judged over the whole of each run
 
 # Part of a log's name, the manoeuvre, and whether the whole of it is one window
 PICTURES = {
@@ -228,6 +231,15 @@ def medians(judged: Iterable[Judged], kind: str) -> tuple[int, dict[str, np.ndar
     return len(together[NOTHING]), found
 
 
+def over_whole_run(judged: Judged) -> dict[str, float]:
+    """By model, the RMS error of the wheel speed in one window that is the whole run."""
+    found = {}
+    for model, (window,) in judged.windows.items():
+        one = window["wheel_speed_mps"]
+        found[model] = float(np.sqrt(np.mean((one.simulated - one.measured) ** 2)))
+    return found
+
+
 def imported(data: Path, out: Path, only: str) -> list[tuple[Source, Run]]:
     """All logs as run folders below `out`. A log that `import` refuses is named and left out."""
     found = []
@@ -299,8 +311,33 @@ def worse(judged: Iterable[Judged]) -> list[str]:
     return lines
 
 
-def page(judged: Sequence[Judged], pictures: Mapping[str, str], options: Sequence[str]) -> str:
-    """The text of the docs page; `pictures` are captions by file."""
+def steps(whole: Mapping[float, Mapping[str, float]]) -> list[str]:
+    """The table of whole runs; errors are by throttle and model."""
+    if not whole:
+        return []
+    levels = sorted(whole)
+    lines = [
+        "## Straight steps of throttle, the whole run",
+        "",
+        "RMS error of the wheel speed, m/s, over the whole of each run, from rest to rest:",
+        "",
+        "| throttle | " + " | ".join(f"{level:.2f}" for level in levels) + " | mean |",
+        "| --- |" + " ---: |" * (len(levels) + 1),
+    ]
+    for model in (PUBLISHED, OURS):
+        errors = [whole[level][model] for level in levels]
+        cells = [f"{error:.3f}" for error in (*errors, float(np.mean(errors)))]
+        lines.append(f"| {model} | {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def page(
+    judged: Sequence[Judged],
+    whole: Mapping[float, Mapping[str, float]],
+    pictures: Mapping[str, str],
+    options: Sequence[str],
+) -> str:
+    """The text of the docs page; `whole` is of `steps`, and `pictures` are captions by file."""
     groups: dict[str, list[Judged]] = {}
     for one in judged:
         groups.setdefault(one.source, []).append(one)
@@ -332,7 +369,7 @@ def page(judged: Sequence[Judged], pictures: Mapping[str, str], options: Sequenc
     ]
     for title, group in groups.items():
         lines += rows(f"`{title}`", group)
-    lines += ["", f"## Where it is worse than {WORSE:g} times doing nothing", ""]
+    lines += ["", *steps(whole), f"## Where it is worse than {WORSE:g} times doing nothing", ""]
     found = worse(judged)
     if found:
         lines += [
@@ -425,7 +462,7 @@ def draw(judged: Judged, series: Mapping[str, Any], title: str, path: Path) -> N
         figure.text(left, above, words, color=INK, size=9.5, va="center")
     canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS)
-    with whole(path) as part:
+    with written(path) as part:
         picture.save(part, format="PNG", optimize=True)
 
 
@@ -466,6 +503,7 @@ def main(arguments: Sequence[str]) -> None:
     configure_jax(blocks=True)
     judged: list[Judged] = []
     pictures: dict[str, str] = {}
+    whole: dict[float, dict[str, float]] = {}
     with tempfile.TemporaryDirectory() as folder, jax.enable_x64(True):
         for source, run in imported(options.data, Path(folder), options.only):
             name = source.car or str(run.about["car_name"])
@@ -476,10 +514,13 @@ def main(arguments: Sequence[str]) -> None:
                 print(f"left out: {error}", flush=True)
                 continue
             judged.append(kept[0])
+            if source.title == STEPS:
+                level = round(float(np.max(run.commands["throttle"])), 2)
+                whole[level] = over_whole_run(judge(source, run, name, file, None)[0])
             pictures |= drawn(source, run, name, file, kept, options.page)
             title = f"{run.path.name}, battery {kept[0].charge:.2f}"
             print("\n".join(rows(title, [kept[0]])), flush=True)
-    text = page(judged, pictures, [f"--car {one}" for one in options.car])
+    text = page(judged, whole, pictures, [f"--car {one}" for one in options.car])
     write_whole(options.page, text)
     print(text)
 
