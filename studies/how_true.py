@@ -457,7 +457,8 @@ def draw(judged: Judged, series: Mapping[str, Any], title: str, path: Path) -> N
                 for i in shown
                 if (one := judged.windows[model][i].get(name)) is not None
             ]
-            draw_windows(axes, *series["measured"][name], lines)
+            signal = series["measured"][name]
+            draw_windows(axes, signal.time, signal.value, lines)
             words = ", ".join(WORDS[name])
         figure.text(left, above, words, color=INK, size=9.5, va="center")
     canvas.draw()
