@@ -128,15 +128,17 @@ PICTURES = {
     "slippery": ("2025-04-16-17-36-01", "Racing on a slippery floor", False),
 }
 
-# What is known of logs that no car predicts well
+# What is known of logs that a car of the library predicts badly
 REASONS = {
-    "steering_steps": "the car of January 2024 goes 1.1 m/s at a throttle of 0.16 to 0.19, where "
-    "that of August barely moves: its speed controller was set in another way",
-    "steering_sines": "as the steering steps",
-    "circles_27_sept_2024_fast_ramp": "below 1.3 m/s, within grip, the car turns by 1.77 rad per "
-    "metre at one command of 20.9°: its steering angle is 17°",
-    "tudelft_1to5": "the car is the one of the examples, before any fit",
-    "f1tenth_ds5": "the car is the one of the examples, before any fit",
+    "steering_steps": "The car of January 2024 goes 1.1 m/s at a throttle of 0.16 to 0.19. That of "
+    "August reaches 0.6 m/s at 0.23. So the speed controller was set in another way, and no battery "
+    "makes up for it. The yaw rate is off because the speed is.",
+    "steering_sines": "They are of January 2024 too.",
+    "circles_27_sept_2024_fast_ramp": "At 0.8 to 1.3 m/s, within grip, the car turns by 1.72 to "
+    "1.77 rad per metre at one command of 20.9° to the left. So its wheels are at 17°, and turn "
+    "less than those of a car that was fitted to faster drives.",
+    "tudelft_1to5": "The car is the one of the examples, before any fit.",
+    "f1tenth_ds5": "The car is the one of the examples, before any fit.",
 }
 
 
@@ -292,23 +294,32 @@ def cell(numbers: Sequence[float]) -> str:
 
 
 def worse(judged: Iterable[Judged]) -> list[str]:
-    """A row for each log with an error of ours beyond `WORSE` times persistence."""
-    lines = []
+    """A table of the logs with an error of ours beyond `WORSE` times persistence, and reasons."""
+    lines, sources = [], []
     for one in judged:
         found = []
-        for kind in ("all", "where something changes"):
+        for kind, mark in (("all", ""), ("where something changes", " (transient)")):
             count, errors = medians([one], kind)
-            for k, name in enumerate(JUDGED):
+            for k, words in enumerate(JUDGED.values()):
                 ours, still = errors[OURS][k], errors[NOTHING][k]
                 if count >= FEWEST and ours > WORSE * still:
-                    words = "" if kind == "all" else ", transient"
-                    found.append(f"{JUDGED[name].split(',')[0]}{words} {ours:.3f} ({still:.3f})")
+                    found.append(f"{words.split(',')[0]}{mark} {still:.3f} · {ours:.3f}")
         if found:
-            reason = REASONS.get(one.source, "")
-            lines.append(
-                f"| `{one.log}` | {one.car} | {one.charge:.2f} | {'; '.join(found)} | {reason} |"
-            )
-    return lines
+            about = f"`{one.source}`: {one.log}"
+            lines.append(f"| {about} | {one.car} | {one.charge:.2f} | {'; '.join(found)} |")
+            sources.append(one.source)
+    if not lines:
+        return ["On no log."]
+    reasons = [f"- `{one}`: {REASONS[one]}" for one in dict.fromkeys(sources) if one in REASONS]
+    return [
+        f"Errors are of {NOTHING} · {OURS}. `replay --compare` warns of the larger ones itself.",
+        "",
+        "| log | car | battery | errors |",
+        "| --- | --- | ---: | --- |",
+        *lines,
+        "",
+        *(["What is known of them:", "", *reasons] if reasons else []),
+    ]
 
 
 def steps(whole: Mapping[float, Mapping[str, float]]) -> list[str]:
@@ -370,17 +381,7 @@ def page(
     for title, group in groups.items():
         lines += rows(f"`{title}`", group)
     lines += ["", *steps(whole), f"## Where it is worse than {WORSE:g} times doing nothing", ""]
-    found = worse(judged)
-    if found:
-        lines += [
-            "In brackets: if nothing changed. `replay --compare` warns of these by itself.",
-            "",
-            "| log | car | battery | errors | what is known |",
-            "| --- | --- | ---: | --- | --- |",
-            *found,
-        ]
-    else:
-        lines.append("On no log.")
+    lines += worse(judged)
     lines += ["", "## Pictures", "", LEGEND, ""]
     for file, caption in pictures.items():
         lines += [caption, "", f"![{Path(file).stem}]({file})", ""]

@@ -116,9 +116,9 @@ def test_the_table_has_median_errors_and_marks_the_least():
 
 
 def test_a_log_worse_than_doing_nothing_is_listed():
-    (line,) = how_true.worse([judged([1.3] * 6, [0.0] * 6)])
-    assert "forward 1.300 (1.000)" in line
-    assert how_true.worse([judged([1.1] * 6, [0.0] * 6)]) == []
+    found = "\n".join(how_true.worse([judged([1.3] * 6, [0.0] * 6)]))
+    assert "| `drift`: log-1 | mycar | 0.80 | forward 1.000 · 1.300; forward (trans" in found
+    assert how_true.worse([judged([1.1] * 6, [0.0] * 6)]) == ["On no log."]
 
 
 def test_a_car_says_which_logs_its_fit_has_seen(tmp_path):
