@@ -131,8 +131,8 @@ PICTURES = {
 # What is known of logs that a car of the library predicts badly
 REASONS = {
     "steering_steps": "The car of January 2024 goes 1.1 m/s at a throttle of 0.16 to 0.19. That of "
-    "August reaches 0.6 m/s at 0.23. So the speed controller was set in another way, and no battery "
-    "makes up for it. The yaw rate is off because the speed is.",
+    "August reaches 0.6 m/s at 0.23. So the speed controller was set in another way, and no "
+    "battery makes up for it. The yaw rate is off because the speed is.",
     "steering_sines": "They are of January 2024 too.",
     "circles_27_sept_2024_fast_ramp": "At 0.8 to 1.3 m/s, within grip, the car turns by 1.72 to "
     "1.77 rad per metre at one command of 20.9° to the left. So its wheels are at 17°, and turn "
