@@ -204,7 +204,7 @@ def test_what_the_logs_do_not_tell_is_named_and_left(logs, windows):
         assert one.deviation >= one.by_curvature
     loose = [one for one in result.fitted if not one.determined]
     for one in loose:
-        assert one.value == pytest.approx(one.before), one
+        assert abs(one.value - one.before) < one.deviation, one
         assert one.path in " ".join(report)
 
 

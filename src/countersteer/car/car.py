@@ -107,6 +107,9 @@ class Tire:
     cornering_stiffness: Scalar = parameter(
         8.0, "1", 0.1, 200, "slope of force over slip angle at zero slip, over the load"
     )
+    cornering_drag: Scalar = parameter(
+        0.0, "1", 0, 1, "rolling drag of a wheel over the tyre's force across it"
+    )
     creep_speed: Scalar = parameter(
         0.05,
         "m/s",

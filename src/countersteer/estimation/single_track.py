@@ -63,7 +63,8 @@ def step(
         contact = tyre.contact(scaled, load, along - rim, dot(slide, velocity), rim)
         pull = share * drive.torque / tire.radius - dragged
         dragged = contact.k_x * (rim - along)
-        slope = (share * drive.slope + 2 * drivetrain.drag(car, rim / tire.radius)) / tire.radius**2
+        drag = 2 * drivetrain.drag(car, tire, contact.force_y / 2, rim / tire.radius)
+        slope = (share * drive.slope + drag) / tire.radius**2
         # Beyond the tyre's grip the wheel spins or locks.
         most = friction * tyre.limit(tire, load)
         over = jnp.minimum(1.0, most / (jnp.abs(pull - slope * along) + 1e-6))

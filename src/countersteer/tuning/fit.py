@@ -2,6 +2,7 @@
 
     minimise  sum over windows, quantities, samples of rho(w (predicted - measured) / scale)
               + sum over parameters of rho((u - u_prior) / width)
+              + sum over what floors share of rho((d_floor - mean of floors) / width)
 
 u is the logarithm of a parameter. The parameters of `ABSOLUTE` may be zero or negative, so u is
 their value itself. rho is the soft L1 loss (`loss`). It limits the cost of outliers, such as a
@@ -13,8 +14,12 @@ equal weight. A long log repeats a manoeuvre; a short one may be the only log of
 Derivatives are exact, through the simulator (`shooting.predict`). The search keeps the declared
 ranges (`Problem.solve`).
 
-All logs share body, motor and servo. Tyres and rolling drag are fitted for each surface. Battery
-charge is fitted for each log that does not state it. Its prior is a full battery.
+All logs share body, motor and servo. Tyres and rolling drag are fitted for each surface, but a
+floor may not change them at will (`SHARED`, `BALANCE`). It may make all tyres grip less. It hardly
+changes their stiffness, or how the grip of front and rear compare: the same rubber is on both. One
+log seldom tells all of that. d is what a fit has moved a parameter by (u - u_prior).
+
+Battery charge is fitted for each log that does not state it. Its prior is a full battery.
 """
 
 import math
@@ -52,6 +57,8 @@ PASSES = 40  # largest number of steps in a search
 DAMPING, EASY, STUCK = 0.01, 1e-6, 1e4  # of a step: first, least, and where a search gives up
 KNOWN = 0.9  # ratio of posterior to prior deviation; below it, a parameter is determined
 STRAIGHT = math.radians(4)  # steering; below it, a window is straight
+SLOW = 2.5  # m/s² of lateral acceleration; below it, a tyre hardly slips
+ENOUGH = 10  # slow windows; fewer do not tell the steering
 SLIDES = math.radians(10)  # sideslip; beyond it, a window slides
 SPINS = 0.5  # m/s of wheel speed above ground speed; beyond it, a window slides too
 HELD_OUT = 2.0  # s, length of a block; whole blocks are fitted or held out
@@ -93,17 +100,31 @@ STEERING = (
     "servo.lag",
     "servo.delay",
 )
-HANDLING = ("body.yaw_inertia", "body.front_roll_share")
+STEERING_MAP = ("servo.gain_left", "servo.gain_right", "servo.trim")  # what slow driving tells
+STIFFNESS = ("tires.front.cornering_stiffness", "tires.rear.cornering_stiffness")
+HANDLING = (
+    "body.yaw_inertia",
+    "body.front_roll_share",
+    "tires.front.cornering_drag",
+    "tires.rear.cornering_drag",
+)
 PARAMETERS = (*SPEEDS, *STEERING, *HANDLING, *TIRES)
 CONTROLLER = ("speed_controller.gain", "speed_controller.feed_forward")
 OF_CAR = (*PARAMETERS, *CONTROLLER)  # `CONTROLLER` is fitted to logs commanded in m/s only
 CHARGE = "battery.charge"  # belongs to a log, not to a car
 FULL = 1.0  # prior charge of a log that does not state it
+EMPTY = 0.1  # least charge that a fit may find: below it, a car's protection ends the drive
 TABLE = (*OF_CAR, CHARGE)
-WIDTHS = {"body.yaw_inertia": 0.3}  # prior standard deviations of logarithms
+WIDTHS = {  # prior standard deviations of logarithms
+    "body.yaw_inertia": 0.3,
+    "servo.limit_left": 0.2,
+    "servo.limit_right": 0.2,
+}
 ABSOLUTE = {  # prior standard deviations in SI units, of parameters that may be near zero
     CHARGE: 0.5,
     "body.front_roll_share": 0.25,
+    "tires.front.cornering_drag": 0.1,
+    "tires.rear.cornering_drag": 0.1,
     "motor.conduction": 0.5,
     "motor.neutral_brake": 0.2,
     "motor.lag": 0.05,
@@ -120,6 +141,21 @@ ABSOLUTE = {  # prior standard deviations in SI units, of parameters that may be
     "tires.front.longitudinal_ratio": 0.2,
     "tires.rear.longitudinal_ratio": 0.2,
 }
+
+
+# What floors share: the standard deviation of a floor's own departure from the mean of all floors
+SHARED = {
+    "tires.front.cornering_stiffness": 0.15,
+    "tires.rear.cornering_stiffness": 0.15,
+    "tires.front.longitudinal_stiffness": 0.2,
+    "tires.rear.longitudinal_stiffness": 0.2,
+    "tires.front.sliding_ratio": 0.03,
+    "tires.rear.sliding_ratio": 0.03,
+    "tires.front.longitudinal_ratio": 0.1,
+    "tires.rear.longitudinal_ratio": 0.1,
+}
+# Two parameters of a floor, and the standard deviation of how far they depart from each other
+BALANCE = (("tires.front.friction", "tires.rear.friction", 0.07),)
 
 
 class Stage(NamedTuple):
@@ -151,6 +187,22 @@ def steered(shots: Shots) -> np.ndarray:
     return ~straight(shots) & ~slides(shots)
 
 
+def slow(shots: Shots) -> np.ndarray:
+    """True for windows without slides, of lateral accelerations below `SLOW`: (windows,)."""
+    speed = np.where(np.isfinite(shots.measured[:, 0]), shots.measured[:, 0], shots.measured[:, 3])
+    aside = np.abs(speed * shots.measured[:, 2])
+    return ~slides(shots) & ~(np.nan_to_num(aside, nan=math.inf) > SLOW).any(axis=1)
+
+
+def steers(shots: Shots) -> np.ndarray:
+    """True for windows that tell the steering: (windows,).
+
+    They are the `slow` ones, straight ones too, if enough of them are `steered`.
+    """
+    chosen = slow(shots)
+    return chosen if (chosen & steered(shots)).sum() >= ENOUGH else steered(shots)
+
+
 def any_window(shots: Shots) -> np.ndarray:
     """True for every window: (windows,)."""
     return np.full(len(shots.surface), True)
@@ -158,7 +210,7 @@ def any_window(shots: Shots) -> np.ndarray:
 
 STAGES = {
     "longitudinal": Stage(SPEEDS, straight),
-    "steering": Stage(STEERING, steered),
+    "steering": Stage((*STEERING, *STIFFNESS), steers),
     "handling": Stage((*HANDLING, *TIRES[:4]), steered),
     "drift": Stage((*HANDLING, *TIRES), slides),
     "all": Stage(PARAMETERS, any_window),
@@ -185,7 +237,7 @@ class Fitted(NamedTuple):
     deviation: float  # standard deviation: the larger of `by_curvature` and `by_halves`
     by_curvature: float  # from the curvature of the cost (`deviations`)
     by_halves: float  # from fits to two halves of the data
-    determined: bool  # False: reset to its prior value
+    determined: bool  # False: the data hardly move its prior
     at_bound: bool  # of its declared range
 
 
@@ -201,7 +253,7 @@ class Result(NamedTuple):
 def declaration(path: str) -> Declaration:
     """The declaration of a car's parameter, by its dotted path of fields, or of `CHARGE`."""
     if path == CHARGE:
-        return Declaration("1", 0.0, 1.0, "of the battery at a log's windows", "fitted")
+        return Declaration("1", EMPTY, 1.0, "of the battery at a log's windows", "fitted")
     *rooms, name = path.split(".")
     part = reduce(getattr, rooms, Car())
     return dict(declarations(type(part)).values())[name]
@@ -363,6 +415,26 @@ class Problem:
         )
         margin = 1e-6 * self.width
         self.prior = np.clip(self.prior, self.low + margin, self.high - margin)
+        self.expected = np.concatenate([np.diag(1 / self.width), self.shared()])
+
+    def shared(self) -> np.ndarray:
+        """The rows of what floors share: their product with u - u_prior is (rows,)."""
+        rows = []
+        for path, width in SHARED.items():
+            floors = [j for j, p in enumerate(self.parameters) if p.path == path]
+            for j in floors if len(floors) > 1 else ():
+                row = np.zeros(len(self.parameters))
+                row[floors] = -1 / len(floors)
+                row[j] += 1
+                rows.append(row / width)
+        for one, other, width in BALANCE:
+            for j, p in enumerate(self.parameters):
+                pair = Parameter(other, p.surface)
+                if p.path == one and pair in self.parameters:
+                    row = np.zeros(len(self.parameters))
+                    row[[j, self.parameters.index(pair)]] = 1, -1
+                    rows.append(row / width)
+        return np.array(rows).reshape(-1, len(self.parameters))
 
     def tabled(self, cars: dict[str, Car], charge: np.ndarray | None = None) -> np.ndarray:
         """The values of `TABLE` for each log, `charge` where it states none: (logs, `TABLE`)."""
@@ -405,7 +477,8 @@ class Problem:
         """
         found = self.predictions(u)
         data = np.where(self.known, (found - self.shots.measured) / self.divisor, 0.0)
-        return np.concatenate([np.nan_to_num(data, nan=1e2).ravel(), (u - self.prior) / self.width])
+        prior = self.expected @ (u - self.prior)
+        return np.concatenate([np.nan_to_num(data, nan=1e2).ravel(), prior])
 
     def jacobian(self, u: Array) -> np.ndarray:
         """The derivatives of `residuals` over u: (residuals, parameters).
@@ -434,7 +507,7 @@ class Problem:
         # A motion that turns chaotic within its window has unbounded derivatives. Drop them.
         chaotic = ~(np.abs(whole) * self.width < WILD)
         whole[chaotic.any(axis=(1, 2, 3))] = 0.0
-        return np.concatenate([whole.reshape(-1, len(self.parameters)), np.diag(1 / self.width)])
+        return np.concatenate([whole.reshape(-1, len(self.parameters)), self.expected])
 
     @property
     def base(self) -> Car:
@@ -545,8 +618,10 @@ def fit(
 ) -> Result:
     """Fit the stage `what`. `all` fits the other stages in `ORDER`, then all parameters at once.
 
-    `cars` are by surface, in the order of the shots' `surface`. Parameters that the logs do not
-    determine are reported and reset to their prior.
+    `cars` are by surface, in the order of the shots' `surface`. They are the prior.
+
+    The steering's steady map is taken from slow windows, if there are enough. `all` then leaves it.
+    At speed a wrong map and wrong tyres can make up for each other, in these logs and no others.
 
     Each stage also fits the charge of logs that do not state it. The exception is a single log in
     a stage with parameters of `SPEEDS`: one log cannot separate charge and motor.
@@ -555,10 +630,12 @@ def fit(
     """
     single_log = len(np.unique(shots.run)) == 1
     total = 0
+    map_told: list[Fitted] = []
     current, charge = cars, np.full(int(shots.run.max()) + 1, FULL)
     for name in ORDER if what == "all" else (what,):
         stage = STAGES[name]
-        free = stage.parameters
+        told = {one.path for one in map_told}
+        free = tuple(path for path in stage.parameters if path not in told)
         if isinstance(shots.commands, SpeedCommand) and set(free) & set(SPEEDS):
             free = (*free, *CONTROLLER)
         if not (single_log and set(free) & set(SPEEDS)):
@@ -577,10 +654,26 @@ def fit(
         solved = problem.solve(problem.start, PASSES)
         total += solved.nfev
         current = problem.cars_at(solved.x)
-        found = problem.charge_at(solved.x)
-        charge[: len(found)] = found
+        charges = problem.charge_at(solved.x)
+        charge[: len(charges)] = charges
         report(f"{name}: {int(chosen.sum())} windows, cost {solved.cost:.4g}")
-    return believed(cars, current, part, free, report, charge, total)
+        if name == "steering" and (slow(shots) & steered(shots)).sum() >= ENOUGH:
+            found = believed(cars, current, part, (*STEERING_MAP, *STIFFNESS), charge=charge)
+            total += found.evaluations
+            map_told = [one for one in found.fitted if one.path in STEERING_MAP]
+            cars, current = (
+                {key: with_map(car, found.cars[key]) for key, car in some.items()}
+                for some in (cars, current)
+            )
+    result = believed(cars, current, part, free, report, charge, total)
+    return result._replace(fitted=map_told + result.fitted)
+
+
+def with_map(car: Car, other: Car) -> Car:
+    """The car with the `STEERING_MAP` of another."""
+    for path in STEERING_MAP:
+        car = changed(car, path, np.float64(value_of(other, path)))
+    return car
 
 
 def estimated_charge(cars: dict[str, Car], shots: Shots) -> np.ndarray:
@@ -612,25 +705,21 @@ def believed(
     charge: np.ndarray | None = None,
     evaluations: int = 0,
 ) -> Result:
-    """The last fit, with deviations. Undetermined parameters are reset, the others refitted.
+    """The last fit, with deviations.
 
     `cars` are the prior. The search starts at `current` and, for each log, at `charge`.
     `evaluations` of earlier stages are added to its own.
+
+    Parameters that the logs do not determine stay where the search ends. Put back at their prior,
+    they would take along what the logs tell only of several together.
     """
     problem = Problem(cars, shots, free)
     solved = problem.solve(Problem(current, shots, free, None, charge).start, PASSES)
+    evaluations += solved.nfev
     curvature, determined = deviations(problem, solved)
     if not determined.all():
-        undetermined = [
-            p for p, known in zip(problem.parameters, determined, strict=True) if not known
-        ]
-        report("not determined: " + ", ".join(sorted({p.path for p in undetermined})))
-        held = Held(problem, determined)
-        solved = held.solve(solved.x[determined], PASSES)
-        whole = problem.prior.copy()
-        whole[determined] = solved.x
-        solved = solved._replace(x=whole)
-    evaluations += solved.nfev
+        loose = zip(problem.parameters, determined, strict=True)
+        report("not determined: " + ", ".join(sorted({p.path for p, known in loose if not known})))
     halves = by_halves(problem, determined, solved.x)
     deviation = np.maximum(curvature, halves)
     near = 1e-3 * problem.width
@@ -657,7 +746,7 @@ def believed(
 
 
 class Held(Problem):
-    """A problem with some parameters fixed at their prior."""
+    """A problem with some parameters fixed at the values of its cars."""
 
     def __init__(self, whole: Problem, free: np.ndarray) -> None:
         """`free` is True for the parameters that stay free: (parameters,)."""
@@ -667,6 +756,7 @@ class Held(Problem):
             setattr(self, name, [one for one, stays in kept if stays])
         for name in ("index", "logarithmic", "start", "prior", "low", "high", "width"):
             setattr(self, name, getattr(whole, name)[free])
+        self.expected = whole.expected[:, free]
 
 
 def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray]:
@@ -684,8 +774,9 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
     count = len(problem.parameters)
     observations = max(1, int(problem.known[:, :, -1].sum()))
     weighted = np.sqrt(loss(solved.fun)[2])[:, None] * problem.jacobian(solved.x)
-    data, prior = weighted[:-count], weighted[-count:]
-    noise = max(1.0, float(np.sum(np.minimum(solved.fun[:-count] ** 2, GROSS)) / observations))
+    samples = problem.known.size
+    data, prior = weighted[:samples], weighted[samples:]
+    noise = max(1.0, float(np.sum(np.minimum(solved.fun[:samples] ** 2, GROSS)) / observations))
     information = data.T @ data / noise + prior.T @ prior
     left = list(range(count))
     deviation = problem.width.copy()
@@ -720,14 +811,12 @@ def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarr
     half_of = halves(whole.shots.run)
     if len(half_of) < 2:
         return np.zeros(len(u))
+    cars, charge = whole.cars_at(u), whole.charge_at(u)
     ends, in_both = np.tile(u, (2, 1)), np.full(len(u), True)
     for half, end in enumerate(ends):
-        problem = Problem(
-            whole.cars,
-            select(whole.shots, half_of == half),
-            list(dict.fromkeys(p.path for p in whole.parameters)),
-            charge=whole.charge_at(u),
-        )
+        part = select(whole.shots, half_of == half)
+        paths = list(dict.fromkeys(p.path for p in whole.parameters))
+        problem = Problem(cars, part, paths, whole.cars, charge)
         columns = np.array([whole.parameters.index(p) for p in problem.parameters], int)
         free = determined[columns]
         end[columns[free]] = Held(problem, free).solve(u[columns[free]], 12).x

@@ -324,7 +324,7 @@ def car_texts(result: Result, about: dict[str, Any], out: Path) -> dict[Path, st
         }
         if about["not_determined"]:
             about_source["not_determined"] = (
-                ", ".join(about["not_determined"]) + ": left as they were"
+                ", ".join(about["not_determined"]) + ": mostly their prior"
             )
         if path == out:
             texts[path] = car_text(result.cars[name], about_source)

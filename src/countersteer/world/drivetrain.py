@@ -3,8 +3,9 @@
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 
-from countersteer.car.car import Car
+from countersteer.car.car import Car, Tire
 from countersteer.signals import Scalar, Wheels
 from countersteer.world.motor import Drive
 
@@ -63,10 +64,15 @@ def rotor_inertia(car: Car) -> Scalar:
     return car.drivetrain.gear_ratio**2 * car.motor.rotor_inertia
 
 
-def drag(car: Car, speed: Scalar) -> Scalar:
-    """Drag torque of one wheel per speed (N m s). Dry drag fades out at standstill."""
-    dry = car.drivetrain.drag * jax.lax.rsqrt(speed**2 + STANDSTILL**2)
-    return (dry + car.drivetrain.drag_viscous) / 4
+def drag(car: Car, tire: Tire, across: Scalar, speed: Scalar) -> Scalar:
+    """Drag torque of one wheel per speed (N m s), with the tyre's force across it (N).
+
+    A tyre that is pushed aside rolls harder: its dry drag grows by cornering_drag · |across| at its
+    radius. Dry drag fades out at standstill.
+    """
+    cornering = tire.cornering_drag * tire.radius * jnp.abs(across)
+    fading = jax.lax.rsqrt(speed**2 + STANDSTILL**2)
+    return (car.drivetrain.drag / 4 + cornering) * fading + car.drivetrain.drag_viscous / 4
 
 
 def axle(lock: Scalar, own_left: Scalar, own_right: Scalar, h: Scalar) -> Axle:

@@ -315,17 +315,18 @@ def grip(car: Car, motion: Motion, friction: Wheels | None = None) -> Grip:
     steered = Steered(*servo.directions(car.body, car.servo, motion.steering))
     rolls, slides = contact_directions(car, steered)
     loads = chassis.wheel_loads(car.body, motion.load_ax, motion.load_ay)
-    found = []
+    found, drag = [], []
     for tire, load, speed, roll, slide in zip(
         tires_on(car, friction), loads, motion.wheels, rolls, slides, strict=True
     ):
         rim = tire.radius * speed
         found.append(tyre.contact(tire, load, dot(roll, velocity) - rim, dot(slide, velocity), rim))
+        drag.append(drivetrain.drag(car, tire, found[-1].force_y, speed))
     driven = drivetrain.driven_speed(car, motion.wheels)
     return Grip(
         steered,
         Wheels(*found),
-        Wheels(*(drivetrain.drag(car, speed) for speed in motion.wheels)),
+        Wheels(*drag),
         motor.drive(car.motor, car.drivetrain, car.battery, motion.duty, motion.charge, driven),
     )
 
