@@ -27,7 +27,7 @@ GRIPS, SPINS = math.radians(20), math.radians(60)  # sideslip of a log that grip
 CRAWLS = 0.5  # m/s; sideslip below this speed is not counted
 YAW_FACTOR, YAW_MARGIN = 1.5, 1.5  # 1, rad/s; a spin turns faster than this times, plus this
 SPUN = 0.03  # part of the gripping windows that may spin
-EMPTY, WITHIN = 0.1, 0.01  # charge; nobody drives on with less, and a search ends near its bound
+NEARLY = 0.02  # charge; so near to its bound, a search ends at it
 TURNS = 0.5  # rad/s; a window that turns
 ONE_HAND = 0.95  # part of the turning windows
 FAR = 2.0  # error outside the fit over the error inside it
@@ -122,7 +122,7 @@ def spins(found: Mapping[str, int], what: str) -> list[str]:
 
 def empty_battery(charge: float, found_by_fit: bool, log: str) -> list[str]:
     """A line if errors are only as small as they are with a battery that nobody drives."""
-    if not found_by_fit or charge >= EMPTY + WITHIN:
+    if not found_by_fit or charge > fit.EMPTY + NEARLY:
         return []
     return [
         f"The battery's charge that agrees best with {log} is {charge:.2f}: no one drives with "

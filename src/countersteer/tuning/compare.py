@@ -250,7 +250,7 @@ def agreeing_charge(run: Run, car: Car, measured: Measured, dt: float) -> float:
         return float(fit.loss(np.append(np.concatenate([*residuals, []]), expected))[0].sum())
 
     found = minimize_scalar(
-        cost, bounds=(0.0, fit.FULL), method="bounded", options={"xatol": CHARGE_WITHIN}
+        cost, bounds=(fit.EMPTY, fit.FULL), method="bounded", options={"xatol": CHARGE_WITHIN}
     )
     return float(found.x) if found.fun < cost(fit.FULL) else fit.FULL
 
