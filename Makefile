@@ -7,7 +7,7 @@ READY := .venv/ready
 # What a drive needs; `make test` and the rest add to it. Modules are compiled when they are imported.
 DRIVES := .venv/drives
 
-.PHONY: drive test check accuracy recovery estimation corners hostile bench notebook sb3 bags browser clean
+.PHONY: drive test check accuracy recovery how-true estimation corners hostile bench notebook sb3 bags browser clean
 
 drive: $(DRIVES)
 	$(BIN)/countersteer drive box
@@ -26,6 +26,10 @@ accuracy: $(READY)
 # Twenty fits: six minutes or more on two cores.
 recovery: $(READY)
 	$(BIN)/python -m studies.recovery docs/recovery.md
+
+# Every log of ../shared/data with three predictions: five minutes on two cores.
+how-true: $(READY)
+	$(BIN)/python -m studies.how_true docs/how_true.md
 
 # Some twenty programs to compile, then 256 cars in each: ten minutes or more on two cores.
 estimation: $(READY)

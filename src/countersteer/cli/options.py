@@ -161,9 +161,13 @@ SPEEDS, CHARGES = span(0.2, 20), span(0, 1)  # m/s; of a battery
 
 
 def nominal_car(made: Parser, car: str | None = "rx7") -> None:
-    """`--car` and `--set`."""
-    default = "" if car else " (default the run's own, else rx7)"
-    made.option("--car", None, str, car, f"library name or .toml file{default}")
+    """`--car` and `--set`. Without a default car, several may be given."""
+    meaning = "library name or .toml file"
+    if car is None:
+        meaning += " (default the run's own, else rx7); repeatable with --compare"
+        made.option("--car", None, str, None, meaning, action="append")
+    else:
+        made.option("--car", None, str, car, meaning)
     meaning = (
         "override a parameter of the car, such as battery.wear=0.5 (repeatable; 'countersteer list "
         "parameters' has them all)"

@@ -47,7 +47,6 @@ def run(options: argparse.Namespace) -> int:
     """`replay`."""
     if not options.compare:
         set_up(options)
-    from countersteer.car.files import load_car
     from countersteer.runs.run import read_run
 
     if options.horizon and not options.compare:
@@ -61,16 +60,27 @@ def run(options: argparse.Namespace) -> int:
     if options.battery is not None and run is not None:
         about = {**run.about, "battery_charge": options.battery}
         run = dataclasses.replace(run, about=about)
-    if run is not None and options.car is None and run.car is not None and not options.set:
-        car, name = run.car, str(run.about.get("car_name", "its own car"))
-    else:
-        name = options.car or (str(run.about.get("car_name", "rx7")) if run else "rx7")
-        car = load_car(name, options.set)
+    cars = cars_of(options, run)
     if options.compare:
         if run is None:
             raise InputError("--compare needs a run folder, such as import makes")
-        return run_compare(options, run, car, name)
+        return run_compare(options, run, cars)
+    if len(cars) > 1:
+        raise InputError("--car: several cars are for --compare: give one")
+    ((name, car),) = cars.items()
     return record(options, replayed(options, run, car, name), options.source.stem)
+
+
+def cars_of(options: argparse.Namespace, run: "Run | None") -> "dict[str, Car]":
+    """The cars of `--car` by name, or else the run's own."""
+    from countersteer.car.files import load_car
+
+    if options.car is None and run is not None and run.car is not None and not options.set:
+        return {str(run.about.get("car_name", "its own car")): run.car}
+    names = options.car or [str(run.about.get("car_name", "rx7")) if run else "rx7"]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise InputError(f"--car {twice[0]}: is given twice")
+    return {name: load_car(name, options.set) for name in names}
 
 
 def replayed(options: argparse.Namespace, run: "Run | None", car: "Car", name: str) -> "Drive":
@@ -135,39 +145,67 @@ def measured_start(run: "Run") -> dict[str, float] | None:
     return None if first is None else dict(zip(names, first, strict=True))
 
 
-def run_compare(options: argparse.Namespace, run: Any, car: "Car", name: str) -> int:
-    """`replay --compare`."""
+def run_compare(options: argparse.Namespace, run: "Run", cars: "dict[str, Car]") -> int:
+    """`replay --compare`. With several cars, the picture is of the one that fits best."""
     from countersteer.compiling import configure_jax
+    from countersteer.tuning import belief
     from countersteer.tuning.compare import compare
     from countersteer.viewing.comparison import draw_comparison
     from countersteer.writing import whole, write_whole
 
     configure_jax()
     horizon = None if options.horizon == "run" else read_horizon(options.horizon or "1.0")
-    result, series = compare(run, car, horizon, options.dt)
+    compared = {name: compare(run, car, horizon, options.dt) for name, car in cars.items()}
+    results = {name: result for name, (result, _) in compared.items()}
+    best = belief.best(results)
+    told = results[best]
+    if len(cars) > 1:
+        scores = {name: belief.score(result) for name, result in results.items()}
+        told = {"best": best, "rule": belief.RULE, "scores": scores, "cars": results}
     out = options.out or run.path
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
         raise InputError(f"--out {out}: cannot be made: {reason.strerror}") from None
-    with whole(out / "compare.json") as told:
-        write_whole(told, json.dumps(result, indent=1) + "\n")
-        draw_comparison(series, out / "compare.png")
+    with whole(out / "compare.json") as file:
+        write_whole(file, json.dumps(told, indent=1) + "\n")
+        draw_comparison(compared[best][1], out / "compare.png")
     if options.json:
-        print(json.dumps(result))
+        print(json.dumps(told))
         return DONE
-    for line in comparison_lines(result):
-        print(line)
-    print(f"{name}: {result['windows']} windows of {result['horizon_s']:g} s; error at their ends:")
-    for quantity, error in result["median_abs_error"].items():
-        nothing = result["persistence"]["median_abs_error"][quantity]
-        print(f"  {quantity:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")
-    print(f"picture: {out / 'compare.png'}")
+    several = len(cars) > 1
+    lines = ranking_lines(results, best) if several else comparison_lines(results[best], best)
+    print("\n".join([*lines, f"picture: {out / 'compare.png'}"]))
     return DONE
 
 
-def comparison_lines(result: dict[str, Any]) -> list[str]:
-    """What a comparison says of the log's battery and sensors."""
+def ranking_lines(results: "dict[str, dict[str, Any]]", best: str) -> list[str]:
+    """What several comparisons say: their warnings, and a table of the cars, the best first."""
+    from countersteer.tuning import belief
+
+    lines = [
+        f"warning: {name}: {line}"
+        for name, result in results.items()
+        for line in result["warnings"]
+    ]
+    still, quantities = "if nothing changed", [*results[best]["median_abs_error"]]
+    width = max(map(len, [*results, still]))
+
+    def row(name: str, cells: list[str]) -> str:
+        return f"{name:{width}} " + " ".join(f"{cell:>15}" for cell in cells)
+
+    lines.append(row("", [*quantities, "battery_charge", "score"]))
+    for name in sorted(results, key=lambda name: (name != best, belief.score(results[name]))):
+        errors, charge = results[name]["median_abs_error"], results[name]["battery_charge"]
+        numbers = (*(errors[q] for q in quantities), charge, belief.score(results[name]))
+        lines.append(row(name, [f"{number:.3f}" for number in numbers]))
+    errors = results[best]["persistence"]["median_abs_error"]
+    lines.append(row(still, [f"{errors[q]:.3f}" for q in quantities]))
+    return [*lines, f"{best} fits best: {belief.RULE}"]
+
+
+def comparison_lines(result: dict[str, Any], name: str) -> list[str]:
+    """What a comparison says of the log's battery and sensors, its warnings and its errors."""
     charge = f"{result['battery_charge']:.2f} of a full one"
     lines = {
         "fit": [f"battery: the log does not tell; {charge} agrees best (--battery sets it)"],
@@ -180,7 +218,13 @@ def comparison_lines(result: dict[str, Any]) -> list[str]:
                 f"log: {one['sensor']}.{one['key']} {one['estimated']:.4g}{deviation} "
                 f"({one['declared_by']}: {one['declared']:.4g})"
             )
-    return lines + [f"warning: {line}" for line in result["warnings"]]
+    lines += [f"warning: {line}" for line in result["warnings"]]
+    windows = f"{result['windows']} windows of {result['horizon_s']:g} s"
+    lines.append(f"{name}: {windows}; error at their ends:")
+    for quantity, error in result["median_abs_error"].items():
+        nothing = result["persistence"]["median_abs_error"][quantity]
+        lines.append(f"  {quantity:16} {error:8.3f}   (if nothing changed: {nothing:.3f})")
+    return lines
 
 
 def read_initial(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

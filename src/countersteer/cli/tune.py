@@ -124,7 +124,7 @@ def tune_all(
     if options.json:
         print(json.dumps(short | {"page": str(page)}))
         return DONE
-    for line in tune.table_lines(about):
+    for line in (*tune.unseen_lines(about), *tune.table_lines(about)):
         print(line)
     for name, told in about["sensors"].items():
         for line in told["warnings"]:

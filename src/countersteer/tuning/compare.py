@@ -12,12 +12,13 @@ windows (`agreeing_charge`). The errors with a full battery are given too.
 
 A steady drift is predicted well by persistence, the prediction that nothing changes. So the same
 errors are given for `persistence`. All errors are repeated for windows in which something changes
-(`transient`), and for windows in which the car drives forward and slides (`sliding`).
+(`transient`), for the others (`steady`), and for windows in which the car drives forward and slides
+(`sliding`).
 """
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -28,14 +29,15 @@ from countersteer.car.car import Car
 from countersteer.errors import InputError
 from countersteer.runs import defects
 from countersteer.runs.run import Run
-from countersteer.tuning import fit
-from countersteer.tuning.log_sensors import resolve
+from countersteer.tuning import belief, fit
+from countersteer.tuning.log_sensors import LogSensors, resolve
 from countersteer.tuning.windows import (
     CHANGES,
     EARLY,
     MEAN,
     QUANTITIES,
     SLOWEST,
+    VELOCITY,
     Measured,
     Reference,
     find_references,
@@ -83,7 +85,62 @@ def compare(
     servo follows the car's own law. The battery has the charge of `run.toml` or of the voltmeter,
     or else the one that agrees best; then `as_if_full` has the errors with a full battery.
 
-    `sensors` has what the log tells of its sensors, and `warnings` a line for each doubt.
+    `sensors` has what the log tells of its sensors. `warnings` has a line for each reason not to
+    believe the car on this log (`belief`), and for each doubt about the log itself.
+    """
+    simulation, sensors, repairs = simulation_of(run, car, horizon, dt)
+    run, commands = simulation.run, simulation.run.commands
+    known = "battery_charge" in sensors.run.about
+    windows, kept = simulation.windows()
+    if not windows:
+        raise InputError(
+            f"{run.path}: no window of {simulation.ticks * dt:g} s has a whole reference: "
+            + " and ".join(simulation.references or ("motion capture",))
+            + " are known in none throughout"
+        )
+    charge, as_if_full = float(run.about["battery_charge"]), {}
+    if not known:
+        as_if_full = {"as_if_full": scores(windows)}
+        charge = agreeing_charge(run, simulation.car, simulation.measured, dt)
+        windows, kept = simulation.windows(charge)
+    lively = [window for window in windows if changes(window)]
+    steady = [window for window in windows if not changes(window)]
+    sliding = [window for window in windows if slides(window)]
+    result = {
+        "windows": len(windows),
+        "horizon_s": round(simulation.ticks * dt, 9),
+        "battery_charge": charge,
+        "battery_known": known,
+        "battery_from": sensors.charge_from or "fit",
+        **scores(windows),
+        **as_if_full,
+        "steady": {"windows": len(steady), **scores(steady)},
+        "transient": {"windows": len(lively), **scores(lively)},
+        "sliding": {"windows": len(sliding), **scores(sliding)},
+        "spins": belief.spin_count(motions(windows)),
+        "sensors": sensors.as_json(),
+    }
+    doubts = belief.of_comparison(result, yaw_rates(windows))
+    result["warnings"] = [*doubts, *repairs, *sensors.warnings]
+    series_of_all = {
+        "title": run.path.name,
+        "result": result,
+        "starts_s": kept,
+        "windows": windows,
+        "measured": {n: reference.signal for n, reference in simulation.references.items()},
+        "commands": commands,
+        "armed": simulation.measured.armed,
+    }
+    return result, series_of_all
+
+
+def simulation_of(
+    run: Run, car: Car, horizon: float | None, dt: float
+) -> tuple["Simulation", LogSensors, list[str]]:
+    """The windows of a log for a car, what the log tells of its sensors, and a line a repair.
+
+    A battery whose charge neither `run.toml` nor the voltmeter tells is full. Raises `InputError`
+    if the log has no window of `horizon` seconds. Without a horizon, the whole log is one window.
     """
     if horizon is not None and not dt <= horizon < math.inf:
         raise InputError(f"--horizon {horizon:g}: give at least a step of {dt:g} s, or run")
@@ -106,48 +163,10 @@ def compare(
         starts, resting = window_starts(measured, commands, ticks, dt)
     if len(starts) == 0:
         raise InputError(why_no_window(run, measured, ticks * dt))
-    known = "battery_charge" in run.about
-    full = {**run.about, "battery_charge": fit.FULL}
-    run = run if known else dataclasses.replace(run, about=full)
+    if "battery_charge" not in run.about:
+        run = dataclasses.replace(run, about={**run.about, "battery_charge": fit.FULL})
     whole = horizon is None
-    simulation = Simulation(run, car, measured, starts, resting, ticks, dt, whole)
-    windows, kept = simulation.windows()
-    if not windows:
-        raise InputError(
-            f"{run.path}: no window of {ticks * dt:g} s has a whole reference: "
-            + " and ".join(simulation.references or ("motion capture",))
-            + " are known in none throughout"
-        )
-    charge, as_if_full = float(run.about["battery_charge"]), {}
-    if not known:
-        as_if_full = {"as_if_full": scores(windows)}
-        charge = agreeing_charge(run, car, measured, dt)
-        windows, kept = simulation.windows(charge)
-    lively = [window for window in windows if changes(window)]
-    sliding = [window for window in windows if slides(window)]
-    result = {
-        "windows": len(windows),
-        "horizon_s": round(ticks * dt, 9),
-        "battery_charge": charge,
-        "battery_known": known,
-        "battery_from": sensors.charge_from or "fit",
-        **scores(windows),
-        **as_if_full,
-        "transient": {"windows": len(lively), **scores(lively)},
-        "sliding": {"windows": len(sliding), **scores(sliding)},
-        "sensors": sensors.as_json(),
-        "warnings": [*repairs, *sensors.warnings],
-    }
-    series_of_all = {
-        "title": run.path.name,
-        "result": result,
-        "starts_s": kept,
-        "windows": windows,
-        "measured": {n: reference.signal for n, reference in simulation.references.items()},
-        "commands": commands,
-        "armed": measured.armed,
-    }
-    return result, series_of_all
+    return Simulation(run, car, measured, starts, resting, ticks, dt, whole), sensors, repairs
 
 
 class Simulation:
@@ -165,7 +184,7 @@ class Simulation:
         whole: bool,
     ) -> None:
         """`starts` are ticks, and a window has `ticks` of them. See `compared` for `whole`."""
-        self.car, self.commands, self.ticks, self.dt = car, run.commands, ticks, dt
+        self.run, self.car, self.measured, self.ticks, self.dt = run, car, measured, ticks, dt
         self.references, self.whole = find_references(measured), whole
         wheel = self.references.get("wheel_speed_mps")
         self.sees = MEAN if wheel is None else wheel.sees
@@ -179,24 +198,33 @@ class Simulation:
         """The windows with a reference, and their start times (s). `charge` replaces the run's."""
         if not len(self.starts):
             return [], []
-        states, dt = self.states, self.dt
+        states = self.states
         if charge is not None:
             motion = states.motion
             states = states._replace(motion=motion._replace(charge=0 * motion.charge + charge))
         with jax.enable_x64(True):
             predicted = simulate(
-                self.car, states, self.commands, self.starts, self.ticks, dt, self.sees
+                self.car, states, self.run.commands, self.starts, self.ticks, self.dt, self.sees
             )
+        return self.windows_of(predicted)
+
+    def windows_of(self, predicted: Mapping[str, np.ndarray]) -> tuple[list[Window], list[float]]:
+        """The windows as `predicted` by anyone: quantities at each tick, (windows, ticks + 1)."""
         found: list[Window] = []
         kept = []
         for i, start in enumerate(self.starts.tolist()):
             series = {name: values[i] for name, values in predicted.items()}
             window = compared(
-                self.references, series, start * dt, dt, bool(self.resting[i]), self.whole
+                self.references,
+                series,
+                start * self.dt,
+                self.dt,
+                bool(self.resting[i]),
+                self.whole,
             )
             if window is not None:
                 found.append(window)
-                kept.append(start * dt)
+                kept.append(start * self.dt)
         return found, kept
 
 
@@ -222,7 +250,7 @@ def agreeing_charge(run: Run, car: Car, measured: Measured, dt: float) -> float:
         return float(fit.loss(np.append(np.concatenate([*residuals, []]), expected))[0].sum())
 
     found = minimize_scalar(
-        cost, bounds=(0.0, fit.FULL), method="bounded", options={"xatol": CHARGE_WITHIN}
+        cost, bounds=(fit.EMPTY, fit.FULL), method="bounded", options={"xatol": CHARGE_WITHIN}
     )
     return float(found.x) if found.fun < cost(fit.FULL) else fit.FULL
 
@@ -317,6 +345,23 @@ def slides(window: Window) -> bool:
     both = (window["vx_mps"], window["vy_mps"])
     vx, vy = (np.append(one.unchanged[:1], one.measured) for one in both)
     return bool(np.all(vx > 0) and np.any(np.arctan2(np.abs(vy), vx) >= SLIDE))
+
+
+def motions(windows: Iterable[Window]) -> Iterator[tuple[belief.Motion, belief.Motion]]:
+    """Measured and simulated motion of the body in the windows that have it whole."""
+    for window in windows:
+        if all(name in window for name in VELOCITY):
+            vx, vy, yaw_rate = (window[name] for name in VELOCITY)
+            yield (
+                (vx.measured, vy.measured, yaw_rate.measured),
+                (vx.simulated, vy.simulated, yaw_rate.simulated),
+            )
+
+
+def yaw_rates(windows: Iterable[Window]) -> np.ndarray:
+    """The yaw rate (rad/s) as measured at the ends of the windows that have it."""
+    name = "yaw_rate_radps"
+    return np.array([window[name].measured[-1] for window in windows if name in window])
 
 
 def scores(windows: Iterable[Window]) -> dict[str, Any]:

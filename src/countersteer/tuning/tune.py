@@ -15,7 +15,7 @@ from countersteer.runs.defects import LogDefect, find_defects, repair
 from countersteer.runs.files import drive_column
 from countersteer.runs.run import Run
 from countersteer.text import toml_of
-from countersteer.tuning import fit, shooting
+from countersteer.tuning import belief, fit, shooting
 from countersteer.tuning.fit import FLOOR, Fitted, Result
 from countersteer.tuning.log_sensors import LogSensors, resolve
 from countersteer.tuning.shooting import Shots
@@ -178,6 +178,11 @@ def tune(
         "evaluations": result.evaluations,
         "cost": result.cost,
     }
+    turned = {
+        name: fitted.shots.measured[fitted.shots.surface == number, 2, -1]
+        for number, name in enumerate(cars)
+    }
+    about["warnings"] = belief.of_fit(about, turned)
     return result, about, parts
 
 
@@ -201,15 +206,19 @@ def transient(shots: Shots) -> np.ndarray:
 
 
 def judged(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
-    """Errors over the windows, and over the transient ones among them."""
+    """Errors over the windows, over the steady and the transient ones, and how many spin."""
     found = fit.errors(cars, shots)
     lively = transient(shots)
     whole = {"windows": found["windows"], "errors": found["simulated"]}
     whole["persistence"] = found["persistence"]
-    whole["transient"] = {"windows": int(lively.sum())}
-    if lively.any():
-        some = fit.errors(cars, fit.select(shots, lively))
-        whole["transient"] |= {"errors": some["simulated"], "persistence": some["persistence"]}
+    for kind, chosen in (("steady", ~lively), ("transient", lively)):
+        whole[kind] = {"windows": int(chosen.sum())}
+        if chosen.any():
+            some = fit.errors(cars, fit.select(shots, chosen))
+            whole[kind] |= {"errors": some["simulated"], "persistence": some["persistence"]}
+    simulated = fit.Problem(cars, shots, ()).predictions()
+    motions = zip(shots.measured[:, :3], simulated[:, :3], strict=True)
+    whole["spins"] = belief.spin_count(motions)
     return whole
 
 
@@ -338,6 +347,35 @@ def _errors(total: dict[str, Any]) -> str:
         f"{quantity} {entry['median_abs_error']:.3f}" for quantity, entry in total["errors"].items()
     )
     return f"median error after {fit.HORIZON:g} s in {total['windows']} windows: {errors}"
+
+
+def unseen_lines(about: dict[str, Any]) -> list[str]:
+    """The lines for a terminal that come first: errors on what was not fitted, and the warnings."""
+    unseen = [run for run in about["runs"] if run["kind"] != "fitted"]
+    names = [name for name in QUANTITIES if any(name in run["errors"] for run in unseen)]
+    width = max((len(run["run"]) + len(run["kind"]) + 2 for run in unseen), default=0)
+    width = max(width, len("- where something changes"))
+    lines = []
+    if unseen:
+        head = " ".join(f"{name:>17}" for name in names)
+        lines.append(f"{'not fitted (if nothing changed)':{width}} windows {head}")
+    for run in unseen:
+        for title, scored in (
+            (f"{run['run']}, {run['kind']}", run),
+            ("- where something changes", run["transient"]),
+        ):
+            cells = [_cell(scored, name) for name in names]
+            if "errors" in scored:
+                lines.append(f"{title:{width}} {scored['windows']:7d} {' '.join(cells)}")
+    return lines + [f"warning: {line}" for line in about["warnings"]]
+
+
+def _cell(scored: dict[str, Any], name: str) -> str:
+    """A quantity's error, and that of persistence in brackets."""
+    if name not in scored.get("errors", {}):
+        return f"{'':17}"
+    error, still = (scored[key][name]["median_abs_error"] for key in ("errors", "persistence"))
+    return f"{f'{error:.3f} ({still:.3f})':>17}"
 
 
 def table_lines(about: dict[str, Any]) -> list[str]:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Declaration, declarations
+from countersteer.tuning.belief import WORDS as QUANTITIES
+from countersteer.tuning.fit import HORIZON
 from countersteer.viewing.page import filled
 from countersteer.viewing.style import (
     INK,
@@ -34,12 +36,6 @@ if TYPE_CHECKING:
 
 Numbers = NDArray[np.float64]
 
-QUANTITIES = {
-    "vx_mps": ("forward velocity", "m/s"),
-    "vy_mps": ("lateral velocity", "m/s"),
-    "yaw_rate_radps": ("yaw rate", "rad/s"),
-    "wheel_speed_mps": ("wheel speed", "m/s"),
-}
 KINDS = {  # of windows, with their description
     "fitted": "windows that were fitted",
     "held out": "of the same runs, not fitted",
@@ -70,18 +66,21 @@ def write_tuning_page(
 def tuning_page(result: Mapping[str, Any], series: Sequence[Mapping[str, Any]]) -> str:
     """The page of a tuning. It loads no other file.
 
-    `result` is the JSON of `countersteer tune`. `low` and `high` of a parameter, if given, are its
-    likely range before the fit. Otherwise the range is a factor of e around a positive prior, and
-    for other priors an interval (`_range`). `new_runs`, if given, says whether to learn the driver
-    again. `correlations`, if given, are [i, j, r] with the indices of two parameters. `series` has
-    one entry for each run: `quantities`, measured over the whole log and simulated in windows, and
-    `commands`. NaN and None are unknown numbers. Text is shown as text, whatever it contains.
+    `result` is the JSON of `countersteer tune`. `warnings`, if given, say when not to believe the
+    fit. `low` and `high` of a parameter, if given, are its likely range before the fit. Otherwise
+    the range is a factor of e around a positive prior, and for other priors an interval (`_range`).
+    `new_runs`, if given, says whether to learn the driver again. `correlations`, if given, are
+    [i, j, r] with the indices of two parameters. `series` has one entry for each run: `quantities`,
+    measured over the whole log and simulated in windows, and `commands`. NaN and None are unknown
+    numbers. Text is shown as text, whatever it contains.
     """
     title = f"{result['car']}: fit of {result['fit']}"
     unfolded = [f"<li>{escape(line)}</li>" for line in result["masked"]]
     fields = {
         "title": escape(title),
         "numbers": _numbers(result),
+        "unseen": _unseen(result["runs"]),
+        "warnings": _warnings(result.get("warnings", [])),
         "headline": _headline(result),
         "errors": _errors(result),
         "next_log": _next_log(result["next_log"]),
@@ -113,6 +112,40 @@ def _numbers(result: Mapping[str, Any]) -> str:
         "fitted in": f"{result['seconds']:.0f} s",
     }
     return "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in shown.items())
+
+
+def _unseen(runs: Sequence[Mapping[str, Any]]) -> str:
+    """The table of errors on logs, or parts of them, that were not fitted; a row for each."""
+    found = []
+    for kind in UNSEEN:
+        for run in (run for run in runs if run["kind"] == kind):
+            lively = run.get("transient", {})
+            found.append((run["run"], f"{kind}, {_windows(run)}", _compared(run)))
+            if _compared(lively):
+                found.append(("– where something changes", _windows(lively), _compared(lively)))
+    names = [name for name in QUANTITIES if any(name in compared for *_, compared in found)]
+    if not names:
+        return "<p>None: all that was given was fitted.</p>"
+    rows = [
+        f"<tr><th><b>{escape(title)}</b> <small>{about}</small></th>"
+        + "".join(_error_cell(compared.get(name)) for name in names)
+        + "</tr>"
+        for title, about, compared in found
+    ]
+    words = (QUANTITIES[name] for name in names)
+    heads = "".join(f"<th>{what}<small>{unit}</small></th>" for what, unit in words)
+    return (
+        '<div class="wide"><table class="errors"><thead><tr><th>median absolute error after '
+        f"{HORIZON:g} s</th>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _warnings(lines: Sequence[str]) -> str:
+    """The reasons not to believe the fit."""
+    items = [f'<li class="bad">{escape(line)}</li>' for line in lines]
+    return _folded(
+        items, "Nothing speaks against this fit. What no log holds, none can contradict."
+    )
 
 
 def _headline(result: Mapping[str, Any]) -> str:
