@@ -208,6 +208,39 @@ def test_what_the_logs_do_not_tell_is_named_and_left(logs, windows):
         assert one.path in " ".join(report)
 
 
+def test_a_floor_that_no_log_tells_of_moves_with_the_others(windows):
+    """Stiffness and balance are the tyre's: what one floor tells, the others take on."""
+    names = [f"tires.{axle}.{what}" for what in ("cornering_stiffness", "friction")
+             for axle in ("front", "rear")]  # fmt: skip
+    shots = windows.shots
+    shots = shots._replace(surface=np.arange(len(shots.surface)) % 2)
+    shots = shots._replace(run=shots.surface)
+    car = load_car("jetracer-tape")
+    problem = fit.Problem({"told": car, "untold": car}, shots, names)
+
+    def prior_cost(moved: dict[tuple[str, int], float]) -> float:
+        u = np.array([moved.get((p.path, p.surface), 0.0) for p in problem.parameters])
+        return float(np.sum((problem.expected[len(u) :] @ u) ** 2))
+
+    stiff, front, rear = names[0], names[2], names[3]
+    both = prior_cost({(stiff, 0): 0.2, (stiff, 1): 0.2})
+    assert both == pytest.approx(0, abs=1e-9) < prior_cost({(stiff, 0): 0.2})
+    # A floor may have less grip of its own, at both ends alike.
+    assert prior_cost({(front, 0): 0.3, (rear, 0): 0.3}) == pytest.approx(0, abs=1e-9)
+    width = fit.BALANCE[0][2]
+    assert prior_cost({(front, 0): 0.3}) == pytest.approx((0.3 / width) ** 2)
+
+
+def test_the_steering_is_told_by_slow_driving(windows):
+    slow = fit.slow(windows.shots)
+    seen = windows.shots.measured
+    aside = np.abs(seen[:, 0] * seen[:, 2]).max(axis=1)
+    assert np.all(aside[slow] < fit.SLOW)
+    chosen = fit.steers(windows.shots)
+    few = (slow & fit.steered(windows.shots)).sum() < fit.ENOUGH
+    assert np.array_equal(chosen, fit.steered(windows.shots) if few else slow)
+
+
 def test_held_out_windows_share_no_instant_with_fitted_ones():
     start = np.arange(0, 30, 0.25)
     kind = fit.blocks(start, np.zeros(len(start)))

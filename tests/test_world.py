@@ -98,6 +98,7 @@ def random_car(rng: np.random.Generator) -> Car:
             f"tires.{end}.longitudinal_stiffness": wide(0.1, 200),
             f"tires.{end}.cornering_stiffness": wide(0.1, 200),
             f"tires.{end}.creep_speed": wide(1e-3, 1),
+            f"tires.{end}.cornering_drag": rng.choice([0.0, wide(0.01, 1)]),
         }
     return varied(RX7, changes)
 
@@ -418,6 +419,8 @@ ODD = {
     "tires.rear.radius": 0.034,
     "tires.rear.inertia": 3e-5,
     "tires.front.sliding_ratio": 0.6,
+    "tires.front.cornering_drag": 0.1,
+    "tires.rear.cornering_drag": 0.06,
     "servo.ackermann": 0.9,
     "servo.gain_left": 1.2,
     "servo.softness": 0.5,
@@ -651,6 +654,8 @@ def second_implementation(m: Manoeuvre, until: float) -> np.ndarray:
             torques[i] = radii[i] * loads[i] * shear[0]
             torques[i] -= line.drag / 4 * spins[i] / math.hypot(spins[i], 0.5)
             torques[i] -= line.drag_viscous / 4 * spins[i]
+            cornering = tire.cornering_drag * radii[i] * loads[i] * abs(shear[1])
+            torques[i] -= cornering * spins[i] / math.hypot(spins[i], 0.5)
         for strength, row in viscous:
             torques -= strength * row * (row @ spins)
         torque, current = motor_torque(duty, charge, shaft @ spins)

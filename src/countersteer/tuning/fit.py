@@ -57,7 +57,7 @@ PASSES = 40  # largest number of steps in a search
 DAMPING, EASY, STUCK = 0.01, 1e-6, 1e4  # of a step: first, least, and where a search gives up
 KNOWN = 0.9  # ratio of posterior to prior deviation; below it, a parameter is determined
 STRAIGHT = math.radians(4)  # steering; below it, a window is straight
-SLOW = 2.5  # m/s² of lateral acceleration; below it, a tyre hardly slips
+SLOW = 1.5  # m/s² of lateral acceleration; below it, a tyre hardly slips
 ENOUGH = 10  # slow windows; fewer do not tell the steering
 SLIDES = math.radians(10)  # sideslip; beyond it, a window slides
 SPINS = 0.5  # m/s of wheel speed above ground speed; beyond it, a window slides too
@@ -101,7 +101,6 @@ STEERING = (
     "servo.delay",
 )
 STEERING_MAP = ("servo.gain_left", "servo.gain_right", "servo.trim")  # what slow driving tells
-STIFFNESS = ("tires.front.cornering_stiffness", "tires.rear.cornering_stiffness")
 HANDLING = (
     "body.yaw_inertia",
     "body.front_roll_share",
@@ -210,7 +209,7 @@ def any_window(shots: Shots) -> np.ndarray:
 
 STAGES = {
     "longitudinal": Stage(SPEEDS, straight),
-    "steering": Stage((*STEERING_MAP, *STEERING[5:], *STIFFNESS), steers),
+    "steering": Stage((*STEERING_MAP, *STEERING[5:]), steers),
     "handling": Stage((*STEERING[2:4], *HANDLING, *TIRES[:4]), steered),
     "drift": Stage((*HANDLING, *TIRES), slides),
     "all": Stage(PARAMETERS, any_window),
@@ -658,7 +657,7 @@ def fit(
         charge[: len(charges)] = charges
         report(f"{name}: {int(chosen.sum())} windows, cost {solved.cost:.4g}")
         if name == "steering" and (slow(shots) & steered(shots)).sum() >= ENOUGH:
-            found = believed(cars, current, part, (*STEERING_MAP, *STIFFNESS), charge=charge)
+            found = believed(cars, current, part, STEERING_MAP, charge=charge)
             total += found.evaluations
             map_told = [one for one in found.fitted if one.path in STEERING_MAP]
             cars, current = (
