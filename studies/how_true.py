@@ -370,9 +370,9 @@ def page(
         "one bold. Logs without motion capture have the wheels' speed in place of the car's.",
         "",
         "*Fitted*: the car's fit has seen these logs, so its errors flatter it. *Held out*: it has "
-        "not. The published model of DART was fitted by its authors to drives on the floor of good "
-        "grip, some of these logs among them; that of ETH to these very logs. Where a log does not "
-        "tell how full the battery was, ours has the charge that agrees best with the log; the "
+        "not. The published models were fitted by their authors: DART's to the floor of good grip, "
+        "with the straight steps among the drives; ETH's to drives of this car. Where a log does "
+        "not tell how full the battery was, ours has the charge that agrees best with the log. The "
         "published models know no battery.",
         "",
         "| logs | car | fit | windows | " + " | ".join(JUDGED.values()) + " |",

@@ -11,7 +11,7 @@ vx, vy (m/s) and w (rad/s) are those of the centre of mass in the body's axes, d
 of the front wheels, and Ff, Fr (N) are the lateral forces of the axles. They have no wheels, so
 their wheel speed is vx. All arrays have one entry for each window.
 
-Sources. DART: Lyons, Ferranti, "DART: A Compact Platform for Autonomous Driving Research", and the
+Sources. DART: Lyons, Ferranti, "DART, Delft's Autonomous-driving Robotic Testbed", and the
 numbers of `System_identification/dart_dynamic_models.py` in github.com/Lorenzo-Lyons/DART. ETH:
 Rothfuss et al., "Bridging the Sim-to-Real Gap with Bayesian Inference", and the model of
 `sim_transfer/sims/dynamics_models.py` in github.com/lasgroup/simulation_transfer. Both have the MIT
