@@ -9,7 +9,7 @@ import numpy as np
 
 from countersteer.viewing.page import filled
 from countersteer.viewing.side_by_side import differences
-from countersteer.viewing.viewer import bundle
+from countersteer.viewing.viewer import FOLDER, bundle
 
 # The steps to which series are rounded: what can be seen on the page. Finer ones make it larger.
 _STEPS = {
@@ -57,6 +57,7 @@ def report_html(*views: dict[str, Any]) -> str:
         "title": html.escape(title),
         # No "<" at all is left, so nothing in the data can end the script element around it.
         "view": data.replace("<", "\\u003c"),
+        "viewer_style": (FOLDER / "viewer.css").read_text(encoding="utf-8").rstrip(),
         "viewer": bundle("report.js"),
     }
     return filled("report_template.html", fields)

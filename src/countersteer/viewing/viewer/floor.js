@@ -49,6 +49,15 @@ export function drawGrid(pen, theme, size, moment, car) {
   c.fillText("x, m", size.width - 160, foot);
 }
 
+/** Round patches of floor whose friction is `factor` times that around them: grip is dark. */
+export function drawPatches(pen, patches, theme) {
+  for (const { x_m, y_m, radius_m, factor } of patches) {
+    const colour = theme.colour(factor < 1 ? "velocity" : "skid");
+    pen.begin().arc(x_m, y_m, radius_m)
+      .fill(colour, 0.06 + 0.3 * Math.min(Math.abs(Math.log2(factor)), 1));
+  }
+}
+
 export function drawWalls(pen, walls, theme, car) {
   const colour = theme.colour("wall"), height = WALL_HEIGHT * car.width_m;
   if (pen.camera.perspective) {

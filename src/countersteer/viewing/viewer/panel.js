@@ -26,10 +26,10 @@ export function numbersIn(list, drives) {
 }
 
 /** The friction circles of a drive's wheels; returns what shows another moment. */
-export function circlesIn(box, drive) {
+export function circlesIn(box, drive, limit = largestLimit(drive)) {
   box.replaceChildren();
   if (!hasWheels(drive)) return () => {};
-  const limit = largestLimit(drive), time = drive.time_s;
+  const time = drive.time_s;
   const made = ["Front left", "Front right", "Rear left", "Rear right"].map((name) => circle(box, name));
   // The car's nose is up, so a force to the left points left.
   const place = (x, y) => [-y / limit * CIRCLE, -x / limit * CIRCLE];

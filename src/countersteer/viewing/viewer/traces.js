@@ -29,11 +29,20 @@ function columnOf(drive, row) {
 
 export class Traces {
   constructor(canvas, drives, theme) {
-    Object.assign(this, { canvas, drives, theme, axis: "time_s", differences: false });
+    Object.assign(this, { canvas, drives, theme, axis: "time_s", differences: false, least: {} });
     this.context = canvas.getContext("2d");
     // All but the cursor changes only with the size, the window and the colours, so it is kept.
     this.still = document.createElement("canvas");
     this.measure();
+  }
+
+  /** Show other drives: of what goes on, the last seconds. `least`: ranges shown in any case. */
+  follow(drives, span) {
+    this.drives = drives;
+    this.measure();
+    this.span = span;
+    this.layOut();
+    this.drawStill();
   }
 
   /** Show the drives over `time_s` or `place_m`, or their differences from the first. */
@@ -57,7 +66,7 @@ export class Traces {
         lines: compared ? this.differencesIn(row) : this.linesOf(row) }));
     if (compared && drives.every((one) => one.x_m)) this.rows.push(this.apart());
     if (compared && axis === "place_m") this.rows.push(this.later());
-    this.rows.forEach(scaleRow);
+    for (const row of this.rows) scaleRow(row, this.least[row.column]);
     this.events = drives.flatMap((one, k) => (axis === "time_s" ? one.events ?? [] : [])
       .map((event) => ({ ...event, k })));
     this.turns = axis === "time_s" && alone ? drives[0].summary.turns ?? [] : [];
@@ -404,9 +413,9 @@ export class Traces {
   }
 }
 
-/** The range of a row and its round numbers. */
-function scaleRow(row) {
-  let low = row.free ? Infinity : 0, high = row.free ? -Infinity : 0;
+/** The range of a row and its round numbers; `least` is what it shows in any case. */
+function scaleRow(row, least) {
+  let [low, high] = least ?? (row.free ? [Infinity, -Infinity] : [0, 0]);
   for (const { y } of row.lines) {
     for (const value of y) {
       if (value < low) low = value;
