@@ -46,13 +46,8 @@ def report_html(*views: dict[str, Any]) -> str:
     Several are side by side: at the same time or, `with_places`, at the same place along the first
     one's path. Texts of the views are shown as text, whatever they contain.
     """
-    runs = [dict(view) for view in views]
-    for run in runs:
-        run["wheels"] = [_wheel(wheel) for wheel in run["wheels"]]
-    compared = {by: list(differences(views, by)) for by in ("time", "place")}
-    shown = {"runs": _plain("runs", runs), "differences": _plain("differences", compared)}
-    data = json.dumps(shown, separators=(",", ":"), allow_nan=False)
-    title = " and ".join(str(run["title" if len(runs) == 1 else "name"]) for run in runs)
+    data = report_json(*views)
+    title = " and ".join(str(run["title" if len(views) == 1 else "name"]) for run in views)
     fields = {
         "title": html.escape(title),
         # No "<" at all is left, so nothing in the data can end the script element around it.
@@ -61,6 +56,16 @@ def report_html(*views: dict[str, Any]) -> str:
         "viewer": bundle("report.js"),
     }
     return filled("report_template.html", fields)
+
+
+def report_json(*views: dict[str, Any]) -> str:
+    """The data of that page: the runs, and the differences of all from the first."""
+    runs = [dict(view) for view in views]
+    for run in runs:
+        run["wheels"] = [_wheel(wheel) for wheel in run["wheels"]]
+    compared = {by: list(differences(views, by)) for by in ("time", "place")}
+    shown = {"runs": _plain("runs", runs), "differences": _plain("differences", compared)}
+    return json.dumps(shown, separators=(",", ":"), allow_nan=False)
 
 
 def _wheel(wheel: dict[str, Any]) -> dict[str, Any]:

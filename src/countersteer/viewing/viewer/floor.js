@@ -49,12 +49,12 @@ export function drawGrid(pen, theme, size, moment, car) {
   c.fillText("x, m", size.width - 160, foot);
 }
 
-/** Round patches of floor whose friction is `factor` times that around them: grip is dark. */
+/** Discs of floor with another friction: slippery ones blue, grippy ones dark; the rim is faint. */
 export function drawPatches(pen, patches, theme) {
-  for (const { x_m, y_m, radius_m, factor } of patches) {
-    const colour = theme.colour(factor < 1 ? "velocity" : "skid");
-    pen.begin().arc(x_m, y_m, radius_m)
-      .fill(colour, 0.06 + 0.3 * Math.min(Math.abs(Math.log2(factor)), 1));
+  for (const { x_m, y_m, radius_m, friction } of patches) {
+    const colour = theme.colour(friction < 1 ? "velocity" : "skid");
+    const alpha = 0.05 + 0.25 * Math.min(Math.abs(Math.log2(friction)), 1);
+    for (const part of [1, 0.7]) pen.begin().arc(x_m, y_m, part * radius_m).fill(colour, alpha);
   }
 }
 
