@@ -355,6 +355,7 @@ const hands = new Hands((changed) => {
 }, HEARTBEAT);
 hands.useThumbs(part("pad-steer"), part("pad-drive"));
 part("pads").hidden = !matchMedia("(pointer: coarse)").matches;
+if (!part("pads").hidden) stage.rig.choose("course");  // nothing lies under the thumbs then
 
 const control = (action, value = 1) => send(say.control({ action, value }));
 
@@ -390,7 +391,7 @@ const CAMERAS = ["follow", "course", "chase"];
 const next = (list, one) => list[(list.indexOf(one) + 1) % list.length];
 
 // Each key: its name, what it does, and whether it stands in the short list below the page.
-const ACTIONS = {
+const ACTIONS = new Map(Object.entries({
   " ": ["space", "pause, go on, or begin again", pause, true],
   p: ["P", "the same", pause],
   r: ["R", "reset: back to the start", () => control("reset"), true],
@@ -406,9 +407,9 @@ const ACTIONS = {
   "]": ["]", "faster clock", () => changeClock(1)],
   "+": ["+", "zoom in", () => zoomBy(1.25)],
   "-": ["−", "zoom out", () => zoomBy(0.8)],
-  0: ["0", "zoom and view back", () => { stage.rig.reset(); dirty = true; }],
   "?": ["?", "all keys", () => part("help").showModal(), true],
-};
+}));
+ACTIONS.set("0", ["0", "zoom and view back", () => { stage.rig.reset(); dirty = true; }]);
 
 function handOver() {
   send(say.handOver({ to: live.state?.who === "person" ? "driver" : "person" }));
@@ -434,7 +435,7 @@ document.addEventListener("keydown", (event) => {
   if (hands.press(event.code)) { event.preventDefault(); return; }
   // Space and Enter press the button that has the focus, as everywhere.
   if ((key === " " || key === "Enter") && target.closest("button, a, summary, label")) return;
-  const action = ACTIONS[key.length === 1 ? key.toLowerCase() : key];
+  const action = ACTIONS.get(key.toLowerCase());
   if (!action || event.repeat && key !== ".") return;
   event.preventDefault();
   action[2]();
@@ -474,6 +475,7 @@ function onChoice(id, answer) {
   });
 }
 
+const act = (key) => ACTIONS.get(key)[2];
 const onClick = (id, answer) => part(id).addEventListener("click", answer);
 onChoice("camera", (mode) => stage.rig.choose(mode));
 onChoice("zoom", (way) => zoomBy(way === "in" ? 1.25 : 0.8));
@@ -486,11 +488,11 @@ for (const chip of document.querySelectorAll(".layers .chip")) {
   });
 }
 onClick("pause", pause);
-onClick("reset", ACTIONS.r[2]);
-onClick("step", ACTIONS["."][2]);
-onClick("record", ACTIONS.v[2]);
+onClick("reset", act("r"));
+onClick("step", act("."));
+onClick("record", act("v"));
 onClick("hand-over", handOver);
-onClick("gyro", ACTIONS.g[2]);
+onClick("gyro", act("g"));
 onClick("reset-parameters", () => parameters.resetAll());
 onClick("driver-ghost", () => send(say.askGhost({ of: "driver" })));
 onClick("offer-take", () => control("slow", Number(part("offer-take").value)));
@@ -544,7 +546,7 @@ onGestures(stage.canvas, {
 // ---- the page itself ----
 
 for (const [name, does, , short] of [["↑ ↓ ← →", "drive; W A S D as well", null, true],
-  ...Object.values(ACTIONS)]) {
+  ...ACTIONS.values()]) {
   const { value, number } = definition(part("key-table"), "", "");
   value.parentNode.firstElementChild.append(...name.split(" ").map((one) => {
     const cap = document.createElement("kbd");

@@ -125,7 +125,7 @@ export class CourseEditor {
     this.status.classList.toggle("bad", Boolean(this.trouble));
     this.status.textContent = this.trouble || (sketch && corridor
       ? `${drawn.points.length} points, ${signed(length, 2)} m along the middle`
-      : `${drawn.walls.length} walls`);
+      : corridor ? "" : `${drawn.walls.length} walls`);
   }
 
   isEnough() {

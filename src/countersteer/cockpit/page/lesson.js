@@ -19,7 +19,10 @@ export function nextCorner(world, state) {
   return best;
 }
 
-const ARROWS = { left: "← (or A)", right: "→ (or D)" };
+const TOUCH = matchMedia("(pointer: coarse)").matches;
+const GAS = TOUCH ? "the right pad up" : "↑ (or W)";
+const SIDES = TOUCH ? { left: "the left pad to the left", right: "the left pad to the right" }
+  : { left: "← (or A)", right: "→ (or D)" };
 
 export class Lesson {
   constructor(box, text, skip) {
@@ -61,9 +64,9 @@ export class Lesson {
   }
 
   show() {
-    const key = ARROWS[this.side];
-    const words = ["Press ↑ (or W) and hold it: the car drives off.",
-      "Keep holding ↑ until the car comes to the corner.",
+    const key = SIDES[this.side];
+    const words = [`Press ${GAS} and hold it: the car drives off.`,
+      `Keep holding ${GAS} until the car comes to the corner.`,
       `Now hold ${key} as well: the tail swings out.`,
       `That is a drift! Let go of ${key} when the nose points down the next straight.`,
       "You drifted a corner. Go on, or press R for a new start and V to record it."][this.step];
