@@ -5,16 +5,15 @@ import itertools
 import math
 import re
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from countersteer.cockpit import messages as m
-from countersteer.course.course import Course
-from countersteer.course.files import course_from_tables, library, load_course
 from countersteer.errors import InputError
 from countersteer.text import toml_of
 from countersteer.writing import alone, write_whole
+
+if TYPE_CHECKING:
+    from countersteer.course.course import Course
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _-]{0,58}")
 
@@ -28,11 +27,15 @@ class CourseShelf:
 
     def names(self) -> list[str]:
         """All names, those of the folder first."""
+        from countersteer.course.files import library  # with it comes JAX
+
         own = sorted(path.stem for path in self.folder.glob("*.toml") if NAME.fullmatch(path.stem))
         return [*own, *(name for name in library() if name not in own)]
 
-    def load(self, name: str) -> Course:
+    def load(self, name: str) -> "Course":
         """A course by its name. Raises `InputError` for one that is not in `names`."""
+        from countersteer.course.files import load_course
+
         if name not in self.names():
             raise InputError(f"course: there is no {name[:60]}")
         file = self.folder / f"{name}.toml"
@@ -42,6 +45,8 @@ class CourseShelf:
         """Write a drawn course, and return its name. What is there stays: names are numbered."""
         if not NAME.fullmatch(drawn.name):
             raise InputError("course: give it a name of letters, digits, spaces, - and _")
+        from countersteer.course.files import library
+
         course_of(drawn)
         text = toml_of(tables_of(drawn))
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -57,9 +62,15 @@ class CourseShelf:
                 return name
         raise AssertionError("numbers have no end")
 
+    def sketch(self, drawn: m.DrawCourse) -> m.Sketch:
+        """What a drawn course looks like. Raises `InputError` where it is none."""
+        return sketch_of(drawn)
 
-def course_of(drawn: m.DrawCourse) -> Course:
+
+def course_of(drawn: m.DrawCourse) -> "Course":
     """The course that was drawn. Raises `InputError` where it is none."""
+    from countersteer.course.files import course_from_tables
+
     if bool(drawn.segments) == bool(drawn.walls):
         raise InputError("course: draw segments or free walls")
     return course_from_tables(tables_of(drawn), "course")
@@ -84,7 +95,7 @@ def tables_of(drawn: m.DrawCourse) -> dict[str, Any]:
         start = {"x_m": drawn.start_x_m, "y_m": drawn.start_y_m}
         return {
             "name": drawn.name or "sketch",
-            "walls_m": [np.round(line.points_m, 4).tolist() for line in drawn.walls],
+            "walls_m": [[[*map(_rounded, p)] for p in line.points_m] for line in drawn.walls],
             "start": start | {"heading_deg": drawn.start_heading_deg},
         }
     tables: dict[str, Any] = {
@@ -103,6 +114,10 @@ def tables_of(drawn: m.DrawCourse) -> dict[str, Any]:
     if drawn.goal_distance_m is not None:
         tables["goal"] = {"distance_m": drawn.goal_distance_m}
     return tables
+
+
+def _rounded(value: float) -> float:
+    return round(value, 4)
 
 
 def _segment(segment: m.Segment) -> dict[str, float]:

@@ -68,6 +68,7 @@ class RealTime:
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cockpit", daemon=True)
         self._closing = False
+        self.made = threading.Event()  # the session is there, or there will be none
         self.held = Held()
         self.failed: str | None = None  # why there is no session
         self.rate = 1.0
@@ -124,6 +125,8 @@ class RealTime:
             self.failed = short_line(error)
             self._say(m.Busy(text=self.failed))
             return
+        finally:
+            self.made.set()
         self._wanted: Setting = self.session.setting
         self._asker: Answer = lambda _: None
         self._settled = 0.0
@@ -274,6 +277,8 @@ class RealTime:
             self._tell_world()
         elif isinstance(message, m.AskRollouts):
             session.rollouts = message.on
+        elif isinstance(message, m.AskGhost):
+            self._ghost()
         else:
             self._asker = answer
             self._change(message)
@@ -300,16 +305,39 @@ class RealTime:
             session.pause()
         self._from()
 
+    def _ghost(self) -> None:
+        """Have the driver drive the setting by itself, beside the drive, as a ghost."""
+        from countersteer.cockpit.ghost import drive_alone
+
+        prepared, setting = self.session.prepared, self.session.setting
+
+        def drive() -> None:
+            try:
+                self._say(drive_alone(prepared, setting))
+            except InputError as error:
+                self._tell_event("note", short_line(error))
+
+        threading.Thread(target=drive, daemon=True).start()
+
     def _change(self, message: Any) -> None:
         """Note what is wanted of the setting. It is made so by `_settle`."""
         from countersteer.cockpit import orders
 
         if isinstance(message, m.SetUp):
+            self._check_names(message)
             course = self._load(message.course) if message.course else None
             self._wanted = orders.set_up(self._wanted, message, course)
             self._settle()
         else:
             self._wanted = orders.wanted(self._wanted, message)
+
+    def _check_names(self, message: m.SetUp) -> None:
+        """Raise `InputError` for a name that is on no menu: others might be files of any kind."""
+        menus = self._menus()
+        for what in ("course", "car", "driver"):
+            name = getattr(message, what)
+            if name and name not in {item.name for item in menus[f"{what}s"]}:
+                raise InputError(f"{what}: there is no {name}")
 
     def _settle(self) -> None:
         """Make the setting as it is wanted, in mid-drive where that can be."""
@@ -320,21 +348,18 @@ class RealTime:
         try:
             if not (same_drive(before, after) and self.session.change(after)):
                 self._say(m.Busy(text="Preparing the drive"))
-                self._say_prepared(prepare(after))
+                try:
+                    self.session.use(prepare(after))
+                finally:
+                    self._tell()
+                    self._say(m.Busy(text=""))
+                self._tell_world()
             self._world_due = True
         except InputError as error:
             self._asker(m.Error(text=short_line(error)))
             self._world_due = True  # the page shows what holds
         self._wanted = self.session.setting
         self._from()
-
-    def _say_prepared(self, prepared: Any) -> None:
-        try:
-            self.session.use(prepared)
-        finally:
-            self._tell()
-            self._say(m.Busy(text=""))
-        self._tell_world()
 
 
 LIVE = ("parameters", "sensors", "patches", "gyro", "strength")  # of a setting

@@ -1,6 +1,7 @@
 """A live drive as an ordinary run folder, with what the hands did beside the commands."""
 
 import contextlib
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ INPUTS = (
     "time_s", "seq", "steer", "throttle", "brake", "source", "driver", "gyro", "gyro_strength",
     "silent",
 )  # fmt: skip
+FAULTS = {"off": "dead", "failing": "spike"}  # kind of fault of a sensor's state
 MOST_CHANGES = 1000  # that are noted in `run.toml`
 
 
@@ -30,14 +32,15 @@ class Recording:
         """Make a numbered folder in `runs`."""
         self._open = contextlib.ExitStack()
         self.folder = self._open.enter_context(new_folder(None, name, runs))
-        self.about = about | {"driven_by": [], "changes": []}
+        self.about = about | {"driven_by": [], "changes": [], "faults": []}
         tables = {"inputs": INPUTS}
         if about["estimate"] != "truth":
             tables["estimate"] = ESTIMATE
+        about = {key: value for key, value in self.about.items() if value != []}
         self._recorder = self._open.enter_context(
             Recorder(
                 self.folder,
-                self.about,
+                about,
                 channels=channels(simulator.car),
                 pace=pace_of(simulator),
                 more=tables,
@@ -46,11 +49,13 @@ class Recording:
         self._onboard = simulator.link.onboard
         self._before: tuple[float, float] | None = None  # the last command that was written
         self._inputs: list[tuple[float, ...]] = []
+        self._input: tuple[float, ...] = ()  # the last, without its time and number
         self._stale = False  # whether `run.toml` is
 
     def input(self, row: tuple[float, ...]) -> None:
         """Note what the hands do from a time on: a row of `INPUTS`."""
-        if not self._inputs or self._inputs[-1][2:] != row[2:]:
+        if self._input != row[2:]:
+            self._input = row[2:]
             self._inputs.append(row)
 
     def driven_by(self, time: float, who: str) -> None:
@@ -58,8 +63,19 @@ class Recording:
         self.about["driven_by"].append({"from_s": time, "who": who})
         self._stale = True
 
+    def sensor(self, time: float, name: str, state: str) -> None:
+        """Note the state of a sensor from a time on; faults are those of `run.toml`."""
+        faults = self.about["faults"]
+        for fault in faults:
+            if fault["sensor"] == name and math.isinf(fault["duration_s"]):
+                fault["duration_s"] = time - fault["start_s"]
+        if state in FAULTS:
+            kind = FAULTS[state]
+            faults.append({"sensor": name, "kind": kind, "start_s": time, "duration_s": math.inf})
+        self.change(time, f"sensor {name}", state)
+
     def change(self, time: float, what: str, value: Any) -> None:
-        """Note a change of the car, a sensor or the floor in mid-drive."""
+        """Note a change of the car, the floor or a sensor's noise in mid-drive."""
         changes = self.about["changes"]
         if len(changes) < MOST_CHANGES:
             changes.append({"time_s": time, "what": what, "to": value})
@@ -70,8 +86,7 @@ class Recording:
         thin = frames(record, len(record.tick))
         if self._onboard:  # a command that is held is one row
             thin = thin._replace(fresh=self._is_new(thin.command))
-        rows = [row for row in self._inputs if row[0] is not None]
-        self._inputs = []
+        rows, self._inputs = self._inputs, []
         columns = list(np.array(rows, float).T) if rows else [np.zeros(0)] * len(INPUTS)
         self._recorder.record(thin, {"inputs": columns})
         if self._stale:

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
@@ -28,8 +28,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from countersteer import __version__
 from countersteer.cockpit import messages as m
+from countersteer.cockpit.courses import CourseShelf
 from countersteer.cockpit.realtime import Finished, RealTime
-from countersteer.cockpit.recordings import RunShelf
+from countersteer.cockpit.recordings import LARGEST_UPLOAD, RunShelf
 from countersteer.errors import InputError
 from countersteer.viewing import viewer
 from countersteer.viewing.style import palette_css
@@ -41,6 +42,7 @@ PER_SECOND, AT_ONCE = 240, 480  # messages of a page; it needs 60 and some
 LARGEST_FRAME = 2**20  # bytes of a message, beyond which the socket is closed
 QUEUED = 200  # messages that a slow page may lag
 SAID_AGAIN = 2.0  # s between two complaints about a flood
+GHOST = ("time_s", "x_m", "y_m", "heading_rad", "sideslip_deg")  # columns
 KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 HEADERS = {
     "Content-Security-Policy": (
@@ -123,9 +125,11 @@ class Page:
 class Hub:
     """All pages, and which of them drives. It runs in the server's loop."""
 
-    def __init__(self, clock: Callable[["Hub"], RealTime], shelf: RunShelf) -> None:
+    def __init__(
+        self, clock: Callable[["Hub"], RealTime], shelf: RunShelf, courses: CourseShelf
+    ) -> None:
         """`clock` makes the session's clock; it is started with the server."""
-        self.shelf = shelf
+        self.shelf, self.courses = shelf, courses
         self.pages: list[Page] = []
         self.driver: Page | None = None
         self._kept: dict[str, str] = {}  # what a page that comes later is told first, by kind
@@ -159,7 +163,7 @@ class Hub:
 
     async def tell_runs(self, new: str = "") -> None:
         """Send the list of runs to all pages; `new` is one that has just come."""
-        found = await asyncio.to_thread(self.shelf.list)
+        found = await asyncio.to_thread(self.shelf.items)
         self._spread(m.Runs, m.encode(m.Runs(runs=found, new=new)))
 
     def _spread(self, kind: type, text: str) -> None:
@@ -234,7 +238,45 @@ class Hub:
                 page.seq = message.seq
                 self.clock.hear(message)
             return
-        self.clock.order(message, self.answer(page))
+        answer = self.answer(page)
+        if isinstance(message, m.Mark | m.Trim | m.AskGhost | m.DrawCourse):
+            asyncio.get_running_loop().create_task(self._aside(message, answer))
+        else:
+            self.clock.order(message, answer)
+
+    async def _aside(self, message: Any, answer: Callable[[Any], None]) -> None:
+        """Carry out an order that has to do with files, beside the drive."""
+        try:
+            if isinstance(message, m.Mark):
+                await asyncio.to_thread(self.shelf.mark, message.run, message.mark)
+                await self.tell_runs()
+            elif isinstance(message, m.Trim):
+                new = await asyncio.to_thread(self.shelf.trim, message.run, message.turn)
+                await self.tell_runs(new)
+            elif isinstance(message, m.AskGhost):
+                await self._ghost(message, answer)
+            else:
+                await self._draw(message, answer)
+        except (InputError, OSError) as error:
+            answer(m.Error(text=" ".join(str(error).split())[:300]))
+
+    async def _ghost(self, message: m.AskGhost, answer: Callable[[Any], None]) -> None:
+        if message.of == "driver":
+            self.clock.order(message, answer)
+        elif message.of == "run":
+            self.say(await asyncio.to_thread(self.shelf.ghost, message.run))
+        else:
+            empty: dict[str, Any] = {name: [] for name in GHOST}
+            self.say(m.Ghost(name="", **empty))
+
+    async def _draw(self, message: m.DrawCourse, answer: Callable[[Any], None]) -> None:
+        if message.action == "sketch":
+            answer(await asyncio.to_thread(self.courses.sketch, message))
+            return
+        name = await asyncio.to_thread(self.courses.save, message)
+        answer(m.Event(what="note", text=f"Saved as {self.courses.folder.name}/{name}.toml."))
+        course = name if message.action == "drive" else ""
+        self.clock.order(m.SetUp(course=course), answer)
 
     def answer(self, page: Page) -> Callable[[Any], None]:
         """Sends a message to one page, from any thread."""
@@ -297,11 +339,12 @@ class Cockpit:
         self,
         clock: Callable[[Hub], RealTime],
         shelf: RunShelf,
+        courses: CourseShelf,
         host: str = "127.0.0.1",
         token: str = "",
     ) -> None:
         """For a server at an address."""
-        self.hub, self.token = Hub(clock, shelf), token
+        self.hub, self.token = Hub(clock, shelf, courses), token
         names = {"127.0.0.1", "localhost", "::1"}
         local = is_loopback(host)
         if not local:
@@ -310,6 +353,11 @@ class Cockpit:
             Route("/", self.page),
             Route("/page/{name}", self.page),
             Route("/viewer/{name}", self.module),
+            Route("/run/{name}.json", self.run),
+            Route("/report/{name}", self.report),
+            Route("/report", self.report),
+            Route("/download/{name}", self.download),
+            Route("/upload", self.upload, methods=["POST"]),
             WebSocketRoute("/ws", self.talk),
         ]
         self.app = Gate(
@@ -342,6 +390,59 @@ class Cockpit:
         if name not in known | {"look.js"}:
             return PlainTextResponse("There is no such module.\n", 404, HEADERS)
         return Response(viewer.module(name), media_type="text/javascript", headers=HEADERS)
+
+    async def run(self, request: Request) -> Response:
+        """A run's view as JSON."""
+        return await self._of_runs(request, self.hub.shelf.data, "application/json", HEADERS)
+
+    async def report(self, request: Request) -> Response:
+        """The page of a run, or of those that `runs` names."""
+        name = request.path_params.get("name")
+        names = [name] if name else request.query_params.get("runs", "").split(",")
+
+        def page(_: str) -> str:
+            return self.hub.shelf.report(names)
+
+        return await self._of_runs(request, page, "text/html", REPORT_HEADERS)
+
+    async def download(self, request: Request) -> Response:
+        """A run's folder as a ZIP file."""
+        name = request.path_params["name"]
+        save = {"Content-Disposition": f'attachment; filename="{quote(name)}.zip"'}
+        packed = self.hub.shelf.packed
+        return await self._of_runs(request, packed, "application/zip", HEADERS | save)
+
+    async def _of_runs(
+        self, request: Request, get: Callable[[str], str | bytes], kind: str, headers: Any
+    ) -> Response:
+        """An answer about runs, for a page that has the token."""
+        if not self.is_token(request.query_params.get("token", "")):
+            return PlainTextResponse("The token is wrong.\n", 403, HEADERS)
+        try:
+            await asyncio.to_thread(self.hub.clock.made.wait)
+            found = await asyncio.to_thread(get, request.path_params.get("name", ""))
+        except (InputError, OSError) as error:
+            return PlainTextResponse(f"{str(error)[:300]}\n", 404, HEADERS)
+        return Response(found, media_type=kind, headers=headers)
+
+    async def upload(self, request: Request) -> Response:
+        """Take in a dropped run or log."""
+        if not self.is_token(request.query_params.get("token", "")):
+            return PlainTextResponse("The token is wrong.\n", 403, HEADERS)
+        content = bytearray()
+        async for chunk in request.stream():
+            content += chunk
+            if len(content) > LARGEST_UPLOAD:
+                words = f"It is over {LARGEST_UPLOAD // 2**20} MB.\n"
+                return PlainTextResponse(words, 413, HEADERS)
+        try:
+            await asyncio.to_thread(self.hub.clock.made.wait)
+            name = request.query_params.get("name", "")[:200]
+            new, remarks = await asyncio.to_thread(self.hub.shelf.take, name, bytes(content))
+        except (InputError, OSError) as error:
+            return PlainTextResponse(" ".join(str(error).split())[:300], 400, HEADERS)
+        await self.hub.tell_runs(new)
+        return PlainTextResponse(remarks[:300], 200, HEADERS)
 
     async def talk(self, ws: WebSocket) -> None:
         """The socket of a page, from its greeting on."""

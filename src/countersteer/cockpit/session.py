@@ -6,7 +6,7 @@ hands do then. What there is to tell comes out of `state` and `told`, as message
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +45,8 @@ READY, DRIVES, PAUSED, ENDED = "ready", "drives", "paused", "ended"
 class Session:
     """The drives of one cockpit. All times are of the car's clock."""
 
-    def __init__(self, prepared: Prepared, runs: Path, recording: bool = True) -> None:
-        """Ready at the start. Drives are recorded in folders in `runs`."""
+    def __init__(self, prepared: Prepared, runs: Path | None, recording: bool = True) -> None:
+        """Ready at the start. With `recording`, drives are folders in `runs`."""
         self.runs, self.records = runs, recording
         self.finished: list[str] = []  # names of the folders that are complete and not told of yet
         self._told: list[Any] = []
@@ -98,11 +98,13 @@ class Session:
 
     def start(self) -> None:
         """Start the clock of a drive that is ready or paused."""
-        if self.phase == READY and self.records:
+        if self.phase == READY and self.records and self.runs is not None:
             name = f"{Path(self.setting.course.name).stem}-person"
             about = set_up.about_of(self.prepared, self._stepper.simulator)
             self._recording = Recording(self.runs, name, about, self._stepper.simulator)
             self._recording.driven_by(0.0, self._name(self.who))
+            for sensor, state in self.setting.sensors.items():
+                self._recording.sensor(0.0, sensor, state)
         if self.phase in (READY, PAUSED):
             self.phase = DRIVES
 
@@ -139,8 +141,7 @@ class Session:
         self._stepper.replace(set_up.simulator_of(changed, self._failing_since))
         before, self.setting = self.setting, changed
         if self._recording is not None:
-            for what, value in differences(before, changed):
-                self._recording.change(self.time, what, value)
+            note_changes(self._recording, self.time, before, changed)
         return True
 
     # ---- the drive ----
@@ -352,16 +353,16 @@ class Session:
         )
 
 
-def differences(before: Setting, after: Setting) -> Iterator[tuple[str, Any]]:
-    """What was changed of a drive, in words and plain data for `run.toml`."""
+def note_changes(recording: Recording, time: float, before: Setting, after: Setting) -> None:
+    """Note what was changed in mid-drive."""
     for path in sorted({*before.parameters, *after.parameters}):
         if before.parameters.get(path) != after.parameters.get(path):
-            yield path, after.parameters.get(path, "as before")
+            recording.change(time, path, after.parameters.get(path, "as before"))
     for name in sorted({*before.sensors, *after.sensors}):
         if before.sensors.get(name) != after.sensors.get(name):
-            yield f"sensor {name}", after.sensors.get(name, "on")
+            recording.sensor(time, name, after.sensors.get(name, "on"))
     if before.patches != after.patches:
-        yield "floor", [dataclasses.asdict(patch) for patch in after.patches]
+        recording.change(time, "floor", [dataclasses.asdict(patch) for patch in after.patches])
 
 
 WHEEL = ("force_x_n", "force_y_n", "limit_n", "slip_mps", "angle_rad")

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from countersteer.cockpit import messages as m
+from countersteer.cockpit.courses import CourseShelf
 from countersteer.cockpit.realtime import RealTime
 from countersteer.cockpit.recordings import RunShelf
 from countersteer.cockpit.server import Cockpit, Hub
@@ -29,17 +30,17 @@ class Start(NamedTuple):
 
 def cockpit(start: Start, host: str = "127.0.0.1", token: str = "") -> Cockpit:
     """The application for a server at an address."""
-    return Cockpit(lambda hub: clock(start, hub), RunShelf(start.runs), host, token)
+    runs, courses = RunShelf(start.runs), CourseShelf(start.courses)
+    return Cockpit(lambda hub: clock(start, hub), runs, courses, host, token)
 
 
 def clock(start: Start, hub: Hub) -> RealTime:
     """The clock, whose session is made when it starts."""
 
     def load(name: str) -> "Course":
-        from countersteer.cockpit.courses import CourseShelf
         from countersteer.course.files import load_course
 
-        return load_course(name) if name == start.course else CourseShelf(start.courses).load(name)
+        return load_course(name) if name == start.course else hub.courses.load(name)
 
     def make() -> "Session":
         from countersteer import kept_programs
@@ -59,9 +60,8 @@ def clock(start: Start, hub: Hub) -> RealTime:
 
     def menus() -> dict[str, Any]:
         from countersteer.car.files import library as cars
-        from countersteer.cockpit.courses import CourseShelf
 
-        courses = list(dict.fromkeys([start.course, *CourseShelf(start.courses).names()]))
+        courses = list(dict.fromkeys([start.course, *hub.courses.names()]))
         return {
             "courses": items(courses),
             "cars": items(list(dict.fromkeys([start.car, *cars()]))),
