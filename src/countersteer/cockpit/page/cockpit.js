@@ -132,6 +132,7 @@ function takeWorld(message) {
   if (!part("gyro-strength").matches(":active")) part("gyro-strength").value = world.gyro.strength;
   part("gyro-value").textContent = `${signed(Number(part("gyro-strength").value), 2)}×`;
   part("record").setAttribute("aria-pressed", world.recording);
+  part("record").querySelector("span").textContent = world.recording ? "Recording" : "Record";
   for (const chip of document.querySelectorAll(".chip[value=rollouts]")) {
     chip.hidden = !world.driver.includes("mppi");
   }
@@ -144,7 +145,7 @@ function takeWorld(message) {
     if (live.state) live.clear();
   }
   stage.measure();
-  Object.assign(stage, { fastest: world.fastest_mps, limit });
+  Object.assign(stage, { fastest: world.fastest_mps, limit, goal: world.goal_m });
   dirty = true;
 }
 
@@ -251,7 +252,6 @@ function showOver() {
 /** What holds now, in the corner of the stage. */
 function showHolds(state) {
   const now = [];
-  if (state.recording) now.push(["fault", "recording"]);
   if (state.who === "driver") now.push(["released", `${world?.driver ?? "the driver"} drives`]);
   if (state.silent && state.phase === "drives" && state.who === "person") {
     now.push(["lost", "nothing heard from the driver’s page: throttle cut"]);

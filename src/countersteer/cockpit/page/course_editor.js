@@ -3,7 +3,7 @@
 import { TopCamera } from "../viewer/camera.js";
 import { drawGhost } from "../viewer/car.js";
 import { element, showChoice } from "../viewer/elements.js";
-import { drawGrid, drawScaleBar, drawWalls } from "../viewer/floor.js";
+import { drawGoal, drawGrid, drawScaleBar, drawWalls } from "../viewer/floor.js";
 import { DEGREES, clamp, signed } from "../viewer/numbers.js";
 import { Pen } from "../viewer/pen.js";
 import * as say from "./messages.js";
@@ -332,7 +332,7 @@ export class CourseEditor {
       drawGhost(pen, car, { x: start.x_m, y: start.y_m, heading: start.heading_rad },
         theme.colour("good"), 1);
     }
-    if (corridor && !drawn.closed && this.sketch) this.drawGoal(pen);
+    if (corridor && !drawn.closed && this.sketch) this.drawGoalOf(pen);
     drawScaleBar(pen, theme, size);
   }
 
@@ -349,7 +349,7 @@ export class CourseEditor {
       colour: theme.colour("ink"), around: theme.colour("floor"), dy: -16 });
   }
 
-  drawGoal(pen) {
+  drawGoalOf(pen) {
     const { line_m: line, length_m: length } = this.sketch;
     let left = Math.min(this.drawn.goal ?? length, length);
     for (let k = 1; k < line.length; k++) {
@@ -357,8 +357,7 @@ export class CourseEditor {
       if (left > long && k < line.length - 1) { left -= long; continue; }
       const [ux, uy] = [(b[0] - a[0]) / long, (b[1] - a[1]) / long], half = this.drawn.width / 2;
       const [x, y] = [a[0] + ux * left, a[1] + uy * left];
-      pen.begin().move(x - uy * half, y + ux * half).to(x + uy * half, y - ux * half)
-        .stroke(this.theme.colour("good"), { wide: 4, dash: [7, 6], cap: "butt" });
+      drawGoal(pen, [x - uy * half, y + ux * half, x + uy * half, y - ux * half], this.theme);
       return;
     }
   }

@@ -58,6 +58,13 @@ export function drawPatches(pen, patches, theme) {
   }
 }
 
+/** The goal's line: x, y of both ends. */
+export function drawGoal(pen, goal, theme) {
+  const [x0, y0, x1, y1] = goal;
+  pen.begin().move(x0, y0).to(x1, y1)
+    .stroke(theme.colour("good"), { wide: 4, dash: [7, 6], cap: "butt", alpha: 0.8 });
+}
+
 export function drawWalls(pen, walls, theme, car) {
   const colour = theme.colour("wall"), height = WALL_HEIGHT * car.width_m;
   if (pen.camera.perspective) {

@@ -4,7 +4,7 @@ import { drawCar, drawGhost } from "./car.js";
 import { CameraRig, TopCamera } from "./camera.js";
 import { beginOf, boundsOf, hasPath, largestLimit, momentAt } from "./drive.js";
 import {
-  drawDrivenPath, drawGrid, drawPatches, drawScaleBar, drawSkids, drawSonar, drawWalls,
+  drawDrivenPath, drawGoal, drawGrid, drawPatches, drawScaleBar, drawSkids, drawSonar, drawWalls,
   drawWholePath,
 } from "./floor.js";
 import { largestOf } from "./numbers.js";
@@ -27,6 +27,7 @@ export class Stage {
     this.mapOnLeft = false;
     this.companions = [];  // other drives that are only outlined, from the same start of the clock
     this.patches = [];  // of other friction on the floor
+    this.goal = null;  // its line
     this.measure();
   }
 
@@ -61,6 +62,7 @@ export class Stage {
     const pen = new Pen(c, camera);
     drawGrid(pen, theme, size, moment, drive.car);
     drawPatches(pen, this.patches, theme);
+    if (this.goal) drawGoal(pen, this.goal, theme);
     this.drives.forEach((one, k) => {
       if (!hasPath(one)) return;
       drawWholePath(pen, one, alone ? theme.colour("soft") : theme.run(k));
