@@ -10,7 +10,8 @@ yaw rate r, the speed v and the largest angle L of the front wheels:
 
 `steering` is limited to ±limit(v) into the turn, and to ±L while it counter-steers, which is while
 it points against r. Without the gyroscope, the axis ramps the angle itself to s · limit(v), and to
-s · L while it counter-steers. The throttle is ramped likewise to throttle − brake.
+s · L while it counter-steers. The throttle is ramped likewise to throttle − brake; beyond `SOFT`
+it rises slowly, so that a key that is pressed again and again is a throttle in between.
 
 All is in plain scalars. It runs on Python's floats, and JAX can trace it.
 """
@@ -29,7 +30,8 @@ RATE_ON, RATE_OFF = RATE / 0.25, RATE / 0.12  # rad/s²
 GAIN = 0.15  # s: rad of steering per rad/s of error
 HALVES = 4.0  # m/s, speed at which half of the lock is left
 ANGLE_ON, ANGLE_OFF = 1 / 0.30, 1 / 0.15  # of the full angle a second, without the gyroscope
-THROTTLE_ON, THROTTLE_OFF = 1 / 0.20, 1 / 0.10  # 1/s
+SOFT = 0.6  # throttle that a key gives at once; from there it rises slowly
+THROTTLE_ON, THROTTLE_SLOW, THROTTLE_OFF = 1 / 0.20, 1 / 1.5, 1 / 0.10  # 1/s
 
 
 class Hands(NamedTuple):
@@ -63,9 +65,8 @@ def steer(
     own = jnp if any(isinstance(x, jax.Array) for x in (*hands, yaw_rate, speed)) else np
     target = ramp(ramps.target, hands.steer * RATE, RATE_ON * dt, RATE_OFF * dt)
     angle = ramp(ramps.angle, hands.steer, ANGLE_ON * dt, ANGLE_OFF * dt)
-    throttle = ramp(
-        ramps.throttle, hands.throttle - hands.brake, THROTTLE_ON * dt, THROTTLE_OFF * dt
-    )
+    rises = own.where(abs(ramps.throttle) < SOFT, THROTTLE_ON, THROTTLE_SLOW) * dt
+    throttle = ramp(ramps.throttle, hands.throttle - hands.brake, rises, THROTTLE_OFF * dt)
     limit = assist.lock / (1 + (speed / HALVES) ** 2)
     held = target / RATE * limit + assist.strength * GAIN * (target - yaw_rate)
     steering = own.where(assist.gyro > 0.5, held, angle * assist.lock)

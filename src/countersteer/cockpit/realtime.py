@@ -262,6 +262,8 @@ class RealTime:
 
     def _carry_out(self, message: Any, answer: Answer) -> None:
         session = self.session
+        if isinstance(message, m.Control | m.HandOver) and self._wanted is not session.setting:
+            self._settle()  # orders are carried out in their order
         if isinstance(message, m.Control):
             self._control(message)
         elif isinstance(message, m.HandOver):
@@ -286,8 +288,6 @@ class RealTime:
     def _control(self, message: m.Control) -> None:
         session = self.session
         if message.action == "reset":
-            if self._wanted is not session.setting:
-                self._settle()
             session.reset()
             self._tell()
             self._publish(time.monotonic())
@@ -327,7 +327,6 @@ class RealTime:
             self._check_names(message)
             course = self._load(message.course) if message.course else None
             self._wanted = orders.set_up(self._wanted, message, course)
-            self._settle()
         else:
             self._wanted = orders.wanted(self._wanted, message)
 

@@ -84,6 +84,11 @@ class Page:
         self.closed = self.closed or len(self._out) > QUEUED
         self._due.set()
 
+    def complain(self, text: str) -> None:
+        """Have an error sent in a line, unless many are waiting: whoever floods reads none."""
+        if len(self._out) < QUEUED // 4:
+            self.send(m.encode(m.Error(text=text[:300])))
+
     def show(self, state: str) -> None:
         """Have a state sent. The latest wins."""
         self._state = state
@@ -111,13 +116,9 @@ class Page:
         self._dropped += 1
         if now - self._complained > SAID_AGAIN:
             self._complained = now
-            self.send(
-                m.encode(
-                    m.Error(
-                        text=f"too many messages: over {PER_SECOND} a second are dropped "
-                        f"({self._dropped} so far)"
-                    )
-                )
+            self.complain(
+                f"too many messages: over {PER_SECOND} a second are dropped "
+                f"({self._dropped} so far)"
             )
         return True
 
@@ -134,6 +135,7 @@ class Hub:
         self.driver: Page | None = None
         self._kept: dict[str, str] = {}  # what a page that comes later is told first, by kind
         self._reserved = ""  # the session key of a page that drove and is gone
+        self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self.clock = clock(self)
 
@@ -205,7 +207,10 @@ class Hub:
         if page is self.driver:
             self.driver, self._reserved = None, page.session
             self.clock.release()
-            asyncio.get_running_loop().call_later(RESUMES, self._pass_on, page.session)
+            if self._timer is not None:
+                self._timer.cancel()
+            loop = asyncio.get_running_loop()
+            self._timer = loop.call_later(RESUMES, self._pass_on, page.session)
 
     def _pass_on(self, session: str) -> None:
         """The page with that key has not come back: another one drives, or nobody."""
@@ -468,7 +473,7 @@ class Cockpit:
                 try:
                     self.hub.hear(page, m.parse(text))
                 except InputError as error:
-                    page.send(m.encode(m.Error(text=str(error)[:300])))
+                    page.complain(str(error))
         except InputError as error:  # of the greeting
             with contextlib.suppress(RuntimeError, WebSocketDisconnect):
                 await ws.send_text(m.encode(m.Error(text=str(error)[:300])))
@@ -480,6 +485,8 @@ class Cockpit:
             pump.cancel()
             with contextlib.suppress(asyncio.CancelledError, Exception):
                 await pump
+            with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it is closed
+                await ws.close()
 
     def is_token(self, given: str) -> bool:
         """Whether a token opens this server."""
