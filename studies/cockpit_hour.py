@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
 EVERY = 60.0  # s between two readings
 
@@ -50,7 +51,9 @@ def cockpit(folder: Path) -> Iterator[tuple[str, int]]:
 @contextlib.contextmanager
 def page(address: str) -> Iterator[ClientConnection]:
     """A page's socket, once it drives."""
-    with connect(address.replace("http", "ws") + "/ws", origin=address, max_size=None) as socket:
+    with connect(
+        address.replace("http", "ws") + "/ws", origin=Origin(address), max_size=None
+    ) as socket:
         socket.send(json.dumps({"kind": "hello"}))
         while json.loads(socket.recv())["kind"] != "world":
             pass

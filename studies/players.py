@@ -29,7 +29,7 @@ REACTION, JITTER = 0.25, 0.05  # s
 FRAME, HELD = 0.02, 0.08  # s between two looks; a key's least time
 FRAMES = 32  # that are remembered
 PLAYERS, FIRST = 200, 7_000_000
-SPREAD = 0.1  # of each habit among players, relative
+SPREAD = 0.05  # of each habit among players, relative
 LONGEST = 30.0  # s of a drive
 
 

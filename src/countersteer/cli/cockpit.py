@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import contextlib
+import json
 import secrets
 import signal
 import socket
@@ -46,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     )  # fmt: skip
     address = address_of(bound, options.host, token)
     if options.json:
-        print(f'{{"address": "{address}"}}', flush=True)
+        print(json.dumps({"address": address}), flush=True)
     else:
         print(f"{address}  (Ctrl-C ends)", flush=True)
     if not options.no_open:

@@ -25,13 +25,13 @@ import numpy as np
 
 from countersteer.signals import Command, Scalar
 
-RATE = math.radians(220)  # rad/s, target of a full axis
-RATE_ON, RATE_OFF = RATE / 0.25, RATE / 0.12  # rad/s²
-GAIN = 0.15  # s: rad of steering per rad/s of error
-HALVES = 4.0  # m/s, speed at which half of the lock is left
+RATE = math.radians(195)  # rad/s, target of a full axis
+RATE_ON, RATE_OFF = RATE / 0.25, RATE / 0.08  # rad/s²
+GAIN = 0.33  # s: rad of steering per rad/s of error
+HALVES = 5.5  # m/s, speed at which half of the lock is left
 ANGLE_ON, ANGLE_OFF = 1 / 0.30, 1 / 0.15  # of the full angle a second, without the gyroscope
-SOFT = 0.6  # throttle that a key gives at once; from there it rises slowly
-THROTTLE_ON, THROTTLE_SLOW, THROTTLE_OFF = 1 / 0.20, 1 / 1.5, 1 / 0.10  # 1/s
+SOFT = 0.57  # throttle that a key gives at once; from there it rises slowly
+THROTTLE_ON, THROTTLE_SLOW, THROTTLE_OFF = 1 / 0.20, 1 / 1.3, 1 / 0.10  # 1/s
 
 
 class Hands(NamedTuple):

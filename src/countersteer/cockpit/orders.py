@@ -3,9 +3,9 @@
 import dataclasses
 from typing import Any
 
-from countersteer.car.files import load_car, parameters
+from countersteer.car.files import load_car
 from countersteer.cockpit import messages as m
-from countersteer.cockpit.setting import Setting, refuse_unknown, sensor_states
+from countersteer.cockpit.setting import Setting, declared, refuse_unknown, sensor_states
 from countersteer.errors import InputError
 
 
@@ -23,7 +23,7 @@ def wanted(setting: Setting, message: Any) -> Setting:
 
 
 def _with_parameter(setting: Setting, message: m.Parameter) -> Setting:
-    known = {p["path"]: p for p in parameters(load_car(setting.car)) if not p["choices"]}
+    known = declared(setting.car)
     refuse_unknown(message.path, known, "parameter")
     values = {path: value for path, value in setting.parameters.items() if path != message.path}
     if message.value is not None:

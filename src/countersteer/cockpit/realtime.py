@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SILENCE = 0.18  # s without input, after which the throttle is cut: it is zero within 0.2 s
 IDLE = 0.2  # s between two states while the clock stands
 STATES = 2  # steps between two states
-BEHIND = 0.25  # s; a clock that lags by more goes on from there
+BEHIND = 0.1  # s; a clock that lags by more goes on from there
 LAGS = 1.0  # s of lagging after which it is said
 AGAIN = 10.0  # s before it is said again
 SETTLE = 0.1  # s between two changes of the car
@@ -69,7 +69,7 @@ class RealTime:
         self._thread = threading.Thread(target=self._run, name="cockpit", daemon=True)
         self._closing = False
         self.made = threading.Event()  # the session is there, or there will be none
-        self.held = Held()
+        self.held = self._felt = Held()
         self.failed: str | None = None  # why there is no session
         self.rate = 1.0
         self._silent = False
@@ -221,8 +221,9 @@ class RealTime:
             self._silent = silent
             if silent:
                 self._tell_event("silence", "No input for 200 ms: the throttle is zero.")
-            else:
+            elif session.who == m.PERSON:
                 self._tell_event("heard", "Input is back.")
+        self._felt = held
         axes = (0.0, 0.0, 0.0) if silent else held.axes
         session.step(Hands(*axes), silent, held.seq, held.source)
         self._tell()
@@ -233,8 +234,8 @@ class RealTime:
 
     def _publish(self, now: float) -> None:
         state = self.session.state(
-            seq=self.held.seq,
-            page_time_ms=self.held.page_time_ms,
+            seq=self._felt.seq,
+            page_time_ms=self._felt.page_time_ms,
             rate=self.rate,
             lag_s=self._lag,
             keeps=self._keeps(),

@@ -59,10 +59,10 @@ class Session:
 
     def use(self, prepared: Prepared) -> None:
         """Drive something else from the start."""
+        stepper = Stepper(prepared.simulator, prepared.pilot, TICKS)
+        stepper.warm_up()
         self.close()
-        self.prepared, self.setting = prepared, prepared.setting
-        self._stepper = Stepper(prepared.simulator, prepared.pilot, TICKS)
-        self._stepper.warm_up()
+        self.prepared, self.setting, self._stepper = prepared, prepared.setting, stepper
         self._begin()
 
     def reset(self) -> None:
@@ -97,11 +97,16 @@ class Session:
         self._first = self._stepper.peek()
 
     def start(self) -> None:
-        """Start the clock of a drive that is ready or paused."""
+        """Start the clock of a drive that is ready or paused.
+
+        Raises `InputError` or `OSError` if it cannot be recorded.
+        """
         if self.phase == READY and self.records and self.runs is not None:
             name = f"{Path(self.setting.course.name).stem}-person"
             about = set_up.about_of(self.prepared, self._stepper.simulator)
+            self.records = False  # if it cannot be made, the next start is without
             self._recording = Recording(self.runs, name, about, self._stepper.simulator)
+            self.records = True
             self._recording.driven_by(0.0, self._name(self.who))
             for sensor, state in self.setting.sensors.items():
                 self._recording.sensor(0.0, sensor, state)

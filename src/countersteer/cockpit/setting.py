@@ -1,6 +1,7 @@
 """`Setting`: what is driven, and its simulator, pilot and task."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -166,7 +167,6 @@ def is_live(setting: Setting, simulator: Simulator) -> bool:
 
 def sliders_of(setting: Setting) -> list[dict[str, Any]]:
     """The parameters that have a range: what `messages.Slider` holds."""
-    first = {p["path"]: p["value"] for p in parameters(load_car(setting.car))}
     return [
         {
             "path": p["path"],
@@ -175,12 +175,17 @@ def sliders_of(setting: Setting) -> list[dict[str, Any]]:
             "low": p["low"],
             "high": p["high"],
             "value": setting.parameters.get(p["path"], p["value"]),
-            "first": first[p["path"]],
+            "first": p["value"],
             "live": not p["path"].endswith(("rate_hz", "update_s", "beams", "regions")),
         }
-        for p in parameters(load_car(setting.car))
-        if not p["choices"]
+        for p in declared(setting.car).values()
     ]
+
+
+@functools.lru_cache(maxsize=8)
+def declared(car: str) -> dict[str, dict[str, Any]]:
+    """The parameters of a car that have a range, by path. They are asked for often."""
+    return {p["path"]: p for p in parameters(load_car(car)) if not p["choices"]}
 
 
 def about_of(prepared: Prepared, simulator: Simulator) -> dict[str, Any]:

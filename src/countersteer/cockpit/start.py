@@ -1,5 +1,6 @@
 """The cockpit put together: session, clock, courses, runs and server. It imports no JAX."""
 
+import functools
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -71,12 +72,13 @@ def clock(start: Start, hub: Hub) -> RealTime:
     return RealTime(make, hub.say, menus, load)
 
 
-def drivers() -> list[str]:
-    """Names of the drivers that can be chosen."""
+@functools.cache
+def drivers() -> tuple[str, ...]:
+    """Names of the drivers that can be chosen. To look for what is installed takes a while."""
     from countersteer.drivers import DRIVERS, own
     from countersteer.drivers.plan import library as plans
 
-    return [*DRIVERS, *plans(), *own.installed()]
+    return (*DRIVERS, *plans(), *own.installed())
 
 
 def items(names: list[str]) -> list[m.Item]:
