@@ -29,6 +29,7 @@ const SEEN = 8.5;  // lengths of the car around it, so that a person sees what c
 const CLOCKS = [0.1, 0.25, 0.5, 1];
 const SAID = 7000, TURN_SHOWN = 3500;  // ms
 const LAGS = 0.25;  // s
+const SPEEDY = 2.5;  // m/s, whose arrow is drawn longest until the car goes faster
 const LEAST = { speed_mps: [0, 3], sideslip_deg: [-40, 40], yaw_rate_degps: [-200, 200],
   steering_deg: [-25, 25], throttle: [0, 100] };
 
@@ -145,7 +146,7 @@ function takeWorld(message) {
     if (live.state) live.clear();
   }
   stage.measure();
-  Object.assign(stage, { fastest: world.fastest_mps, limit, goal: world.goal_m });
+  Object.assign(stage, { fastest: Math.max(stage.fastest, SPEEDY), limit, goal: world.goal_m });
   dirty = true;
 }
 
@@ -288,6 +289,9 @@ function showState(state, moment) {
     state.who === "person" ? `Hand over to ${world?.driver ?? "the driver"}` : "Take back";
   showChoice(part("clock"), state.rate);
   part("time").textContent = `${signed(state.time_s, 2)} s`;
+  Object.assign(part("meter").dataset, { picturesPerS: meter.rate.toFixed(1),
+    drawingMs: meter.cost.toFixed(2), keyToPictureMs: meter.wait.toFixed(1),
+    lagMs: (1000 * state.lag_s).toFixed(0) });
   part("meter").textContent = `${signed(meter.rate, 0)} pictures/s, ${signed(meter.wait, 0)} ms `
     + `from key to picture, lag ${signed(1000 * state.lag_s, 0)} ms`;
 }
@@ -299,7 +303,7 @@ function describe(state, moment) {
     time: state.time_s, phase: state.phase, x: moment.x.toFixed(3), y: moment.y.toFixed(3),
     heading: (moment.heading * 180 / Math.PI).toFixed(1), speed: signed(moment.speed, 2),
     sideslip: moment.sideslip.toFixed(1), yawRate: moment.yawRate.toFixed(0),
-    who: state.who, contacts: state.wall_contacts, throttle: state.throttle,
+    course: world?.course ?? "", car: world?.car ?? "", who: state.who, contacts: state.wall_contacts, throttle: state.throttle,
     corner: corner ? corner.away.toFixed(2) : "", side: corner?.side ?? "",
   });
 }
@@ -321,6 +325,7 @@ function frame() {
   dirty = false;
   if (!state || !live.time_s.length) { showOver(); return; }
   const moment = live.moment(begin / 1000);
+  stage.fastest = Math.max(stage.fastest, Math.abs(moment.speed));
   stage.patches = brush.shown();
   stage.draw([moment], 0);
   describe(state, moment);

@@ -49,7 +49,8 @@ export class Lesson {
     const corner = nextCorner(world, state);
     if (corner) this.side = corner.side;
     if (this.step === 4 && state.phase === "ready") { this.end(); return; }
-    if (this.step < 4 && ["ended", "ready"].includes(state.phase)) this.step = 0;
+    if (this.step !== 4 && ["ended", "ready"].includes(state.phase)) this.step = 0;
+    else if (this.step < 4 && state.wall_contacts > 0) this.step = 5;
     else if (this.step === 0 && state.speed_mps > 0.3) this.step = 1;
     else if (this.step === 1 && corner && corner.away < NEAR) this.step = 2;
     else if (this.step === 2 && Math.abs(state.sideslip_deg) > DRIFTS) this.step = 3;
@@ -69,7 +70,9 @@ export class Lesson {
       `Keep holding ${GAS} until the car comes to the corner.`,
       `Now hold ${key} as well: the tail swings out.`,
       `That is a drift! Let go of ${key} when the nose points down the next straight.`,
-      "You drifted a corner. Go on, or press R for a new start and V to record it."][this.step];
+      "You drifted a corner! Go on, or press R for a new start. Each drive is recorded: see Runs.",
+      `That was the wall. Press ${TOUCH ? "Reset" : "R"} and steer into the corner a little sooner.`,
+    ][this.step];
     this.box.hidden = this.step === null;
     if (words && this.text.textContent !== words) this.text.textContent = words;
   }

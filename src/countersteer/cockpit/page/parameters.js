@@ -5,6 +5,7 @@ import { signed } from "../viewer/numbers.js";
 import * as say from "./messages.js";
 
 const STEPS = 400;  // of a slider
+const WIDE = 4;  // a slider goes from the first value over this to it times this, within the limits
 const EVERY = 80;  // ms between two values of a slider that is being moved
 
 const written = (value) => {
@@ -12,6 +13,17 @@ const written = (value) => {
   const size = Math.abs(value);
   return signed(value, size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 || size === 0 ? 2 : 4);
 };
+
+/** The range of a slider around the first value: all that is allowed is too much to aim in. */
+function rangeOf({ low, high, first }) {
+  if (!first) return [low, high];
+  const [least, most] = [first / WIDE, first * WIDE].sort((a, b) => a - b);
+  return [Math.max(low ?? least, least), Math.min(high ?? most, most)];
+}
+
+/** A parameter's name in words, without its unit, which stands beside the value. */
+const inWords = (name, unit) =>
+  (unit && unit !== "1" ? name.replace(/_[a-z0-9]+$/, "") : name).replaceAll("_", " ");
 
 export class Parameters {
   constructor(box, search, send) {
@@ -42,9 +54,10 @@ export class Parameters {
     groups.values().next().value?.setAttribute("open", "");
   }
 
-  row(parent, { path, unit, meaning, low, high, live }, name) {
+  row(parent, slider, name) {
+    const { path, unit, meaning, live } = slider, [low, high] = rangeOf(slider);
     const row = element(parent, "div", { class: "parameter" }), id = `set-${path}`;
-    element(row, "label", { for: id }, name.replaceAll("_", " "));
+    element(row, "label", { for: id }, inWords(name, unit));
     const value = element(row, "output", { for: id });
     const bounded = low !== null && high !== null;
     const hint = `${meaning}${live ? "" : " A change starts a new drive."}`;
@@ -78,7 +91,10 @@ export class Parameters {
   soon(path, value) {
     const first = !this.waiting.has(path);
     this.waiting.set(path, value);
-    if (first) setTimeout(() => this.now(path, this.waiting.get(path)), EVERY);
+    if (!first) return;
+    setTimeout(() => {
+      if (this.waiting.has(path)) this.now(path, this.waiting.get(path));
+    }, EVERY);
   }
 
   now(path, value) {
