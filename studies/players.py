@@ -7,28 +7,37 @@ habits of his own: when he lifts, when he presses, how fast he likes to go. The 
 one; only people differ. The habits were found on other seeds (`--search`).
 """
 
+import argparse
+import os
+import sys
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from countersteer.batch.evaluate import interval
 from countersteer.batch.population import Drawn
 from countersteer.batch.trials import run_trials
 from countersteer.car.car import Car
+from countersteer.car.files import load_car
 from countersteer.car.parameter import pytree
 from countersteer.cockpit import gyro
 from countersteer.cockpit.gyro import Assist, Hands, Ramps
+from countersteer.compiling import configure_jax
 from countersteer.course.course import Course
+from countersteer.course.files import load_course
 from countersteer.course.position import Legs, legs_of
 from countersteer.drivers.driver import ROUNDING, Observation
 from countersteer.pilot import Pilot
 from countersteer.signals import Array, Command, Scalar
+from countersteer.task.judge import DRIFT, Outcome
 
 REACTION, JITTER = 0.25, 0.05  # s
 FRAME, HELD = 0.02, 0.08  # s between two looks; a key's least time
 FRAMES = 32  # that are remembered
 PLAYERS, FIRST = 200, 7_000_000
+SEARCHED, STEPS, TRIED, BEST = 1_200_000, 8, 384, 12  # first seed of the search, and its size
 SPREAD = 0.05  # of each habit among players, relative
 LONGEST = 30.0  # s of a drive
 
@@ -191,3 +200,69 @@ def player(course: Course, car: Car, habits: Habits, on: bool, strength: float =
     lock = float(min(car.servo.limit_left, car.servo.limit_right))
     assist = Assist(float(on), strength, lock)
     return Player(legs=legs_of(course, 1), habits=habits, assist=assist)
+
+
+def row(name: str, score: Any) -> str:
+    """A line of the table."""
+    count = len(score.outcome)
+    reached = np.asarray(score.outcome) == Outcome.REACHED.code
+    slips = np.asarray(score.turns.peak_sideslip)
+    drifts = reached & (slips.min(axis=1) > DRIFT)
+    corners = np.isfinite(np.asarray(score.turns.end)).sum(axis=1)
+    laps = np.asarray(score.goal_time)[reached]
+
+    def share(which: np.ndarray) -> str:
+        low, high = interval(int(which.sum()), count)
+        return f"{which.sum()} ({100 * low:.0f}–{100 * high:.0f} %)"
+
+    cells = [name, share(reached), share(drifts), f"{np.mean(corners):.1f}"]
+    cells.append(f"{np.degrees(np.median(slips[reached])):.0f}°" if reached.any() else "–")
+    cells.append(f"{np.median(laps):.1f} s" if reached.any() else "–")
+    return f"| {' | '.join(cells)} |"
+
+
+def search(course: Course, car: Car, on: bool, first: int) -> Habits:
+    """Habits that drift round the course, by the cross-entropy method."""
+    draw = np.random.default_rng(first)
+    low, high = np.array(LOW), np.array(HIGH)
+    middle, wide = (low + high) / 2, (high - low) / 2.5
+    for step in range(STEPS):
+        tried = np.clip(middle + wide * draw.standard_normal((TRIED, len(low))), low, high)
+        players = [player(course, car, Habits(*map(float, t)), on) for t in tried]
+        score = drive(players, course, car, first + step * TRIED)
+        best = tried[np.argsort(-worth(score, course))[:BEST]]
+        middle, wide = best.mean(axis=0), best.std(axis=0) + 0.01 * (high - low)
+        print(step, Habits(*(round(float(value), 3) for value in middle)), flush=True)
+    return Habits(*map(float, middle))
+
+
+def worth(score: Any, course: Course) -> np.ndarray:
+    """How well each drive went: progress, and how much each turn was a drift."""
+    reached = np.asarray(score.outcome) == Outcome.REACHED.code
+    slips = np.asarray(score.turns.peak_sideslip) * np.isfinite(np.asarray(score.turns.end))
+    drifted = np.clip(slips / DRIFT, 0, 1)
+    way = np.asarray(score.furthest) - course.start_distance
+    found: np.ndarray = way / course.length + 0.5 * reached + 1.5 * np.mean(drifted**2, axis=1)
+    return found + 3.0 * (reached & (drifted.min(axis=1) >= 1)) + drifted.min(axis=1)
+
+
+def main() -> int:
+    """Print the table."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--search", choices=("on", "off"), help="look for habits, on other seeds")
+    given = options.parse_args()
+    configure_jax(blocks=True, cores=os.cpu_count() or 1)
+    course, car = load_course("box"), load_car("rx7")
+    if given.search:
+        search(course, car, given.search == "on", SEARCHED)
+        return 0
+    print("| steering | get round | get round drifting | turns | sideslip | lap |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: |")
+    for name, habits, on in (("gyroscope", WITH_GYRO, True), ("keys alone", WITHOUT, False)):
+        players = [player(course, car, habits, on)] * PLAYERS
+        print(row(name, drive(players, course, car, FIRST)), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -466,6 +466,20 @@ def test_the_page_names_only_what_is_on_a_menu(page, wanted):
     assert "there is no" in page.until("error")["text"]
 
 
+def test_a_slider_changes_the_car_and_the_page_is_told(page):
+    def mass(world: Any) -> Any:
+        return next(s for s in world["sliders"] if s["path"] == "body.mass_kg")
+
+    page.say(kind="parameter", path="body.mass_kg", value=2.0)
+    changed = mass(page.until("world", lambda w: mass(w)["value"] == 2.0))
+    assert changed["live"]
+    assert changed["first"] < 2.0
+    page.say(kind="parameter", path="body.mass_kg", value=None)
+    page.until("world", lambda w: mass(w)["value"] == changed["first"])
+    page.say(kind="parameter", path="body.mass_kg", value=-1.0)
+    assert "body.mass_kg must be in" in page.until("error")["text"]
+
+
 def test_hostile_messages_and_a_flood_leave_the_next_drive_as_it_was(address, page, key):
     draw = random.Random(6)
     for _ in range(300):

@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from countersteer.errors import InputError
@@ -96,14 +97,13 @@ def anything(default: Any = dataclasses.MISSING) -> Any:
     return _field(Kind("anything"), default)
 
 
-message = dataclasses.dataclass(frozen=True, kw_only=True)
 POINT = Kind("list", 2, 2, of=Kind("number", -1e4, 1e4))
 
 
 # ---- of the page ----
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Hello:
     """The first message. `session` is the key of a `Welcome` before a reload, to drive on."""
 
@@ -111,7 +111,7 @@ class Hello:
     session: str = text(64, "")
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Input:
     """What hands do, up to 60 times a second; also the sign that the page is alive."""
 
@@ -123,7 +123,7 @@ class Input:
     page_time_ms: float = number(0, 1e13, 0.0)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Control:
     """The clock. `slow` sets its rate to `value`; `step` advances a paused drive by one step."""
 
@@ -131,7 +131,7 @@ class Control:
     value: float = number(0.05, 1, 1.0)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class SetUp:
     """A new drive. An empty name keeps what is set; names are those of the menus of `World`."""
 
@@ -145,7 +145,7 @@ class SetUp:
     battery: float = number(-1, 1, -1.0)  # charge; below 0 keeps it
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Gyro:
     """The steering gyroscope."""
 
@@ -153,7 +153,7 @@ class Gyro:
     strength: float = number(0, 2, 1.0)  # over the usual gain
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Parameter:
     """A parameter of the car, by the path and in the unit of `World`; null: as it was at first."""
 
@@ -161,7 +161,7 @@ class Parameter:
     value: float | None = number(-1e9, 1e9, None, null=True)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Sensor:
     """The state of a sensor, or of the radio, by a name of `World`."""
 
@@ -169,7 +169,7 @@ class Sensor:
     state: str = choice(SENSOR_STATES)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Patch:
     """A disc on the floor with another friction; it fades to 1 at the rim."""
 
@@ -179,28 +179,28 @@ class Patch:
     friction: float = number(0.1, 2)  # factor
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Paint:
     """All patches on the floor, in place of those before. Where they overlap, factors multiply."""
 
     patches: list[Patch] = several(Patch, MOST_PATCHES)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class HandOver:
     """Who drives from now on."""
 
     to: str = choice((PERSON, DRIVER))
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Record:
     """Whether drives are kept as run folders. It holds from the next start on."""
 
     on: bool = flag()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Mark:
     """A mark on a run of `Runs`; `learn` leaves out those marked bad."""
 
@@ -208,7 +208,7 @@ class Mark:
     mark: str = choice(MARKS)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Trim:
     """A new run from one turn of a run, counted from 1; the old one stays."""
 
@@ -216,7 +216,7 @@ class Trim:
     turn: int = whole(1, 1000)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class AskGhost:
     """A car to drive beside: that of a run, or the chosen driver on the same course."""
 
@@ -224,14 +224,14 @@ class AskGhost:
     run: str = text(200, "")
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class AskRollouts:
     """Whether the planner's paths are wanted, which costs it time."""
 
     on: bool = flag()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Segment:
     """A piece of a course: a straight (`turn_deg` 0) or a turn (`straight_m` 0)."""
 
@@ -240,14 +240,14 @@ class Segment:
     radius_m: float = number(0, 1000, 0.0)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Line:
     """A free wall: points [x, y] in metres."""
 
     points_m: list[list[float]] = several(POINT, MOST_POINTS, least=2)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class DrawCourse:
     """A drawn course, of segments or of free walls. `sketch` only looks at it (answer: `Sketch`).
 
@@ -272,7 +272,7 @@ class DrawCourse:
 # ---- of the server ----
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Welcome:
     """Who the page is: it drives or watches. Sent again when that changes."""
 
@@ -282,7 +282,7 @@ class Welcome:
     watching: int = whole(0, 10**6, 0)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Item:
     """An entry of a menu."""
 
@@ -290,7 +290,7 @@ class Item:
     label: str = text(200)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Slider:
     """A parameter of the car, from its declaration."""
 
@@ -304,7 +304,7 @@ class Slider:
     live: bool = flag()  # false: a change starts a new drive
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class SensorState:
     """A sensor (or the radio), its state, and the states that it can have."""
 
@@ -313,7 +313,7 @@ class SensorState:
     states: list[str] = several(Kind("choice", choices=SENSOR_STATES), 4)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class World:
     """What is driven, and all menus. Sent for each new drive and when a setting changes."""
 
@@ -344,7 +344,7 @@ class World:
     drivers: list[Item] = several(Item, 1000)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Wheel:
     """A wheel's forces, in its own axes."""
 
@@ -355,7 +355,7 @@ class Wheel:
     angle_rad: float = measured()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Believed:
     """The pilot's estimate, with the ellipse of its place (two deviations)."""
 
@@ -370,7 +370,7 @@ class Believed:
     ellipse_rad: float = measured()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class State:
     """The car now. Series have the names of the report's view."""
 
@@ -407,7 +407,7 @@ class State:
     recording: bool = flag()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Turn:
     """The figures of a turn that has ended, as the judge has them."""
 
@@ -426,7 +426,7 @@ class Turn:
     who: str = choice((PERSON, DRIVER))
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Ended:
     """The drive has ended. `run` is its folder's id; empty where it was not recorded."""
 
@@ -440,7 +440,7 @@ class Ended:
     run: str = text(200, "")
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class RunItem:
     """A recorded run."""
 
@@ -456,7 +456,7 @@ class RunItem:
     simulated: bool = flag()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Runs:
     """All recorded runs, the newest first. `new` is one that has just come."""
 
@@ -464,7 +464,7 @@ class Runs:
     new: str = text(200, "")
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Ghost:
     """A car to draw beside, over the time of the drive; no rows: none."""
 
@@ -476,7 +476,7 @@ class Ghost:
     sideslip_deg: list[float] = column()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Rollouts:
     """Paths that the planner looks at: a time and `paths`, as the report's view has them."""
 
@@ -484,7 +484,7 @@ class Rollouts:
     paths: list[dict[str, Any]] = anything()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Sketch:
     """The walls of a drawn course."""
 
@@ -494,14 +494,14 @@ class Sketch:
     length_m: float = measured()
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Busy:
     """The server prepares something for a while; empty: it is done."""
 
     text: str = text(300)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Event:
     """Something has happened. `what` is for the page's code, `text` for the person."""
 
@@ -509,7 +509,7 @@ class Event:
     text: str = text(300)
 
 
-@message
+@dataclass(frozen=True, kw_only=True)
 class Error:
     """What was wrong with a message of the page."""
 

@@ -33,6 +33,7 @@ from countersteer.cockpit.realtime import Finished, RealTime
 from countersteer.cockpit.recordings import LARGEST_UPLOAD, RunShelf
 from countersteer.errors import InputError
 from countersteer.viewing import viewer
+from countersteer.viewing.page import FOLDER
 from countersteer.viewing.style import palette_css
 
 PAGE = Path(__file__).with_name("page")
@@ -379,7 +380,7 @@ class Cockpit:
         """The page, or a file of it. Only names of the folder are known."""
         name = request.path_params.get("name", "index.html")
         if name == "shared.css":
-            text = palette_css() + (viewer.FOLDER.parent / "page.css").read_text(encoding="utf-8")
+            text = palette_css() + (FOLDER / "page.css").read_text(encoding="utf-8")
             text += (viewer.FOLDER / "viewer.css").read_text(encoding="utf-8")
             return Response(text, media_type="text/css", headers=HEADERS)
         files = {path.name: path for path in PAGE.iterdir() if path.suffix in KINDS}

@@ -402,7 +402,7 @@ def observation(record: Record, dt: float) -> Observation:
     parts: Any = jax.tree.map(
         heard, now.readings[:-1], is_leaf=lambda node: isinstance(node, Reading)
     )
-    return Observation(np.float64(dt * tick), *parts, now.estimate)
+    return Observation(*(np.float64(dt * tick), *parts, now.estimate))
 
 
 def rollouts_of(time: float, seen: Any) -> m.Rollouts:

@@ -122,9 +122,9 @@ def car_of(setting: Setting) -> Car:
     """The simulated car. Raises `InputError` if a parameter is out of range."""
     car = load_car(setting.car, [f"{k}={v!r}" for k, v in setting.parameters.items()])
     check(car, "parameter")
-    sensors = car.sensors
+    sensors: Any = car.sensors
     for name, state in setting.sensors.items():
-        part = getattr(sensors, name, None)
+        part: Any = getattr(sensors, name, None)
         if state == "noisier" and hasattr(part, "noise"):
             louder = dataclasses.replace(part, noise=part.noise * NOISIER)
             sensors = dataclasses.replace(sensors, **{name: louder})
