@@ -57,8 +57,8 @@ class Habits(NamedTuple):
 
 
 # Found on other seeds by `--search`.
-WITH_GYRO = Habits(1.1, 1.4, 0.8, 1.8, 2.2, 0.9, 0.12, 0.12, 2.0)
-WITHOUT = Habits(1.1, 1.4, 0.8, 1.8, 2.2, 0.9, 0.12, 0.12, 2.0)
+WITH_GYRO = Habits(0.83, 0.73, 0.59, 1.39, 2.48, 0.67, 0.05, 0.23, 1.4)
+WITHOUT = Habits(0.83, 0.73, 0.59, 1.39, 2.48, 0.67, 0.05, 0.23, 1.4)
 # Ranges of the search.
 LOW = Habits(0.3, 0.2, 0.2, 1.3, 1.0, 0.3, 0.0, 0.05, 0.0)
 HIGH = Habits(1.8, 2.0, 1.5, 3.0, 3.5, 2.0, 0.4, 0.3, 4.0)

@@ -1,6 +1,5 @@
 """Courses by name: those of the library, and those that were drawn on the page."""
 
-import dataclasses
 import itertools
 import math
 import re
@@ -121,7 +120,7 @@ def _rounded(value: float) -> float:
 
 
 def _segment(segment: m.Segment) -> dict[str, float]:
-    fields = dataclasses.asdict(segment)
+    fields = m.plain(segment)
     if bool(segment.straight_m) == bool(segment.turn_deg):
         raise InputError("course: a segment is a straight or a turn")
     return {key: value for key, value in fields.items() if value}

@@ -10,8 +10,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 from countersteer.errors import InputError
 from countersteer.reading import values
@@ -97,13 +96,22 @@ def anything(default: Any = dataclasses.MISSING) -> Any:
     return _field(Kind("anything"), default)
 
 
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def message(cls: type[T]) -> type[T]:
+    """Make a class a frozen dataclass, whose fields are declared as above."""
+    return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+
 POINT = Kind("list", 2, 2, of=Kind("number", -1e4, 1e4))
 
 
 # ---- of the page ----
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Hello:
     """The first message. `session` is the key of a `Welcome` before a reload, to drive on."""
 
@@ -111,7 +119,7 @@ class Hello:
     session: str = text(64, "")
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Input:
     """What hands do, up to 60 times a second; also the sign that the page is alive."""
 
@@ -123,7 +131,7 @@ class Input:
     page_time_ms: float = number(0, 1e13, 0.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Control:
     """The clock. `slow` sets its rate to `value`; `step` advances a paused drive by one step."""
 
@@ -131,7 +139,7 @@ class Control:
     value: float = number(0.05, 1, 1.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class SetUp:
     """A new drive. An empty name keeps what is set; names are those of the menus of `World`."""
 
@@ -145,7 +153,7 @@ class SetUp:
     battery: float = number(-1, 1, -1.0)  # charge; below 0 keeps it
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Gyro:
     """The steering gyroscope."""
 
@@ -153,7 +161,7 @@ class Gyro:
     strength: float = number(0, 2, 1.0)  # over the usual gain
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Parameter:
     """A parameter of the car, by the path and in the unit of `World`; null: as it was at first."""
 
@@ -161,7 +169,7 @@ class Parameter:
     value: float | None = number(-1e9, 1e9, None, null=True)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Sensor:
     """The state of a sensor, or of the radio, by a name of `World`."""
 
@@ -169,7 +177,7 @@ class Sensor:
     state: str = choice(SENSOR_STATES)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Patch:
     """A disc on the floor with another friction; it fades to 1 at the rim."""
 
@@ -179,28 +187,28 @@ class Patch:
     friction: float = number(0.1, 2)  # factor
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Paint:
     """All patches on the floor, in place of those before. Where they overlap, factors multiply."""
 
     patches: list[Patch] = several(Patch, MOST_PATCHES)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class HandOver:
     """Who drives from now on."""
 
     to: str = choice((PERSON, DRIVER))
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Record:
     """Whether drives are kept as run folders. It holds from the next start on."""
 
     on: bool = flag()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Mark:
     """A mark on a run of `Runs`; `learn` leaves out those marked bad."""
 
@@ -208,7 +216,7 @@ class Mark:
     mark: str = choice(MARKS)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Trim:
     """A new run from one turn of a run, counted from 1; the old one stays."""
 
@@ -216,7 +224,7 @@ class Trim:
     turn: int = whole(1, 1000)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class AskGhost:
     """A car to drive beside: that of a run, or the chosen driver on the same course."""
 
@@ -224,14 +232,14 @@ class AskGhost:
     run: str = text(200, "")
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class AskRollouts:
     """Whether the planner's paths are wanted, which costs it time."""
 
     on: bool = flag()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Segment:
     """A piece of a course: a straight (`turn_deg` 0) or a turn (`straight_m` 0)."""
 
@@ -240,14 +248,14 @@ class Segment:
     radius_m: float = number(0, 1000, 0.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Line:
     """A free wall: points [x, y] in metres."""
 
     points_m: list[list[float]] = several(POINT, MOST_POINTS, least=2)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class DrawCourse:
     """A drawn course, of segments or of free walls. `sketch` only looks at it (answer: `Sketch`).
 
@@ -272,7 +280,7 @@ class DrawCourse:
 # ---- of the server ----
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Welcome:
     """Who the page is: it drives or watches. Sent again when that changes."""
 
@@ -282,7 +290,7 @@ class Welcome:
     watching: int = whole(0, 10**6, 0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Item:
     """An entry of a menu."""
 
@@ -290,7 +298,7 @@ class Item:
     label: str = text(200)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Slider:
     """A parameter of the car, from its declaration."""
 
@@ -304,7 +312,7 @@ class Slider:
     live: bool = flag()  # false: a change starts a new drive
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class SensorState:
     """A sensor (or the radio), its state, and the states that it can have."""
 
@@ -313,7 +321,7 @@ class SensorState:
     states: list[str] = several(Kind("choice", choices=SENSOR_STATES), 4)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class World:
     """What is driven, and all menus. Sent for each new drive and when a setting changes."""
 
@@ -344,7 +352,7 @@ class World:
     drivers: list[Item] = several(Item, 1000)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Wheel:
     """A wheel's forces, in its own axes."""
 
@@ -355,7 +363,7 @@ class Wheel:
     angle_rad: float = measured()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Believed:
     """The pilot's estimate, with the ellipse of its place (two deviations)."""
 
@@ -370,7 +378,7 @@ class Believed:
     ellipse_rad: float = measured()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class State:
     """The car now. Series have the names of the report's view."""
 
@@ -407,7 +415,7 @@ class State:
     recording: bool = flag()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Turn:
     """The figures of a turn that has ended, as the judge has them."""
 
@@ -426,7 +434,7 @@ class Turn:
     who: str = choice((PERSON, DRIVER))
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Ended:
     """The drive has ended. `run` is its folder's id; empty where it was not recorded."""
 
@@ -440,7 +448,7 @@ class Ended:
     run: str = text(200, "")
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class RunItem:
     """A recorded run."""
 
@@ -456,7 +464,7 @@ class RunItem:
     simulated: bool = flag()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Runs:
     """All recorded runs, the newest first. `new` is one that has just come."""
 
@@ -464,7 +472,7 @@ class Runs:
     new: str = text(200, "")
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Ghost:
     """A car to draw beside, over the time of the drive; no rows: none."""
 
@@ -476,7 +484,7 @@ class Ghost:
     sideslip_deg: list[float] = column()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Rollouts:
     """Paths that the planner looks at: a time and `paths`, as the report's view has them."""
 
@@ -484,7 +492,7 @@ class Rollouts:
     paths: list[dict[str, Any]] = anything()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Sketch:
     """The walls of a drawn course."""
 
@@ -494,14 +502,14 @@ class Sketch:
     length_m: float = measured()
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Busy:
     """The server prepares something for a while; empty: it is done."""
 
     text: str = text(300)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Event:
     """Something has happened. `what` is for the page's code, `text` for the person."""
 
@@ -509,7 +517,7 @@ class Event:
     text: str = text(300)
 
 
-@dataclass(frozen=True, kw_only=True)
+@message
 class Error:
     """What was wrong with a message of the page."""
 
@@ -604,6 +612,12 @@ def encode(said: Any) -> str:
     """A message as JSON. Numbers are rounded; NaN and infinity become null."""
     plain = {"kind": kind_of(type(said))} | _plain(said)
     return json.dumps(plain, separators=(",", ":"), allow_nan=False)
+
+
+def plain(part: Any) -> dict[str, Any]:
+    """The fields of a message or a part of one, as plain data."""
+    found: dict[str, Any] = _plain(part)
+    return found
 
 
 def _plain(value: Any) -> Any:

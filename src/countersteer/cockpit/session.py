@@ -367,7 +367,7 @@ def note_changes(recording: Recording, time: float, before: Setting, after: Sett
         if before.sensors.get(name) != after.sensors.get(name):
             recording.sensor(time, name, after.sensors.get(name, "on"))
     if before.patches != after.patches:
-        recording.change(time, "floor", [dataclasses.asdict(patch) for patch in after.patches])
+        recording.change(time, "floor", [m.plain(patch) for patch in after.patches])
 
 
 WHEEL = ("force_x_n", "force_y_n", "limit_n", "slip_mps", "angle_rad")
