@@ -365,19 +365,15 @@ def drives(welcome: Any) -> bool:
 
 
 @pytest.fixture(scope="module")
-def key(address: str) -> str:
-    """The session of a page that has driven. Who has it drives on at once."""
-    first = Client(address)
-    found = first.until("welcome", drives)["session"]
-    first.until("world")
-    first.close()
-    return str(found)
+def last() -> dict[str, str]:
+    """The session of the last page that drove: who has it drives on at once."""
+    return {"key": ""}
 
 
 @pytest.fixture
-def page(address: str, key: str) -> Iterator[Client]:
-    made = Client(address, session=key)
-    made.until("welcome", drives)
+def page(address: str, last: dict[str, str]) -> Iterator[Client]:
+    made = Client(address, session=last["key"])
+    last["key"] = made.until("welcome", drives)["session"]
     made.say(kind="control", action="reset")
     made.until("state", lambda s: s["phase"] == "ready")
     yield made
@@ -413,11 +409,11 @@ def test_a_second_page_watches_until_the_first_has_gone(address, page):
     other.close()
 
 
-def test_a_page_that_is_loaded_again_drives_on(address, page, key):
+def test_a_page_that_is_loaded_again_drives_on(address, page, last):
     page.throttle(0.2)
     page.close()
     stranger = Client(address)
-    again = Client(address, session=key)
+    again = Client(address, session=last["key"])
     assert again.until("welcome")["role"] == "drives"
     assert again.until("state")["time_s"] > 0.2
     assert stranger.until("welcome")["role"] == "watches"
@@ -480,7 +476,7 @@ def test_a_slider_changes_the_car_and_the_page_is_told(page):
     assert "body.mass_kg must be in" in page.until("error")["text"]
 
 
-def test_hostile_messages_and_a_flood_leave_the_next_drive_as_it_was(address, page, key):
+def test_hostile_messages_and_a_flood_leave_the_next_drive_as_it_was(address, page, last):
     draw = random.Random(6)
     for _ in range(300):
         page.socket.send(hostile(draw).replace("control", "contrary"))
@@ -488,7 +484,7 @@ def test_hostile_messages_and_a_flood_leave_the_next_drive_as_it_was(address, pa
         page.socket.send("{" * 20)
     page.until("error", lambda e: "too many messages" in e["text"])
     page.close()
-    after = Client(address, session=key)
+    after = Client(address, session=last["key"])
     after.until("welcome", drives)
     after.say(kind="set_up", course="box", car="rx7", driver="drift-turn", seed=0, laps=1)
     after.say(kind="control", action="reset")

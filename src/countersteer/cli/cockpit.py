@@ -55,14 +55,22 @@ def run(options: argparse.Namespace) -> int:
     made = cockpit(start, options.host, token)
     serving = server.server_of(made)
 
+    async def watch() -> None:
+        await made.hub.ready()
+        serving.should_exit = serving.should_exit or made.hub.clock.failed is not None
+
     async def serve() -> None:
         loop = asyncio.get_running_loop()
+        watching = loop.create_task(watch())
         for caught in (signal.SIGINT, signal.SIGTERM):
             with contextlib.suppress(NotImplementedError):  # on Windows
                 loop.add_signal_handler(caught, setattr, serving, "should_exit", True)
         await serving.serve([bound])
+        watching.cancel()
 
     asyncio.run(serve())
+    if made.hub.clock.failed is not None:
+        raise InputError(made.hub.clock.failed)
     return DONE
 
 

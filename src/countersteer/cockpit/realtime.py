@@ -27,6 +27,7 @@ STATES = 2  # steps between two states
 BEHIND = 0.1  # s; a clock that lags by more goes on from there
 LAGS = 1.0  # s of lagging after which it is said
 AGAIN = 10.0  # s before it is said again
+PATIENCE = 10.0  # s, for the thread to end
 SETTLE = 0.1  # s between two changes of the car
 DRIVES, READY, PAUSED = "drives", "ready", "paused"  # as in `session`
 
@@ -80,10 +81,11 @@ class RealTime:
         self._thread.start()
 
     def close(self) -> None:
-        """Complete the record and end the thread."""
+        """Complete the record and end the thread. What is being compiled is not waited for long."""
         self._closing = True
         self._wake.set()
-        self._thread.join()
+        if self.made.is_set():
+            self._thread.join(PATIENCE)
 
     def hear(self, said: m.Input) -> None:
         """Take an input of the page that drives. It is felt in the next step."""
@@ -158,6 +160,7 @@ class RealTime:
         self._wall, self._car = time.monotonic(), self.session.time
         self._lag, self._lags_since, self._said_at = 0.0, 0.0, -AGAIN
         self._busy = 0.0  # s of computing in a step, smoothed
+        self._silent = False
 
     def _round(self) -> None:
         """Orders, then one step if it is due, or else a wait."""

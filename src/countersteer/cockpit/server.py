@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -117,10 +117,8 @@ class Page:
         self._dropped += 1
         if now - self._complained > SAID_AGAIN:
             self._complained = now
-            self.complain(
-                f"too many messages: over {PER_SECOND} a second are dropped "
-                f"({self._dropped} so far)"
-            )
+            text = f"too many messages: over {PER_SECOND} a second are dropped"
+            self.send(m.encode(m.Error(text=f"{text} ({self._dropped} so far)")))
         return True
 
 
@@ -136,6 +134,7 @@ class Hub:
         self.driver: Page | None = None
         self._kept: dict[str, str] = {}  # what a page that comes later is told first, by kind
         self._reserved = ""  # the session key of a page that drove and is gone
+        self._tasks: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self.clock = clock(self)
@@ -143,7 +142,7 @@ class Hub:
     def start(self) -> None:
         """Within the server's loop."""
         self._loop = asyncio.get_running_loop()
-        self._first_list = self._loop.create_task(self.tell_runs())
+        self._begin(self.tell_runs())
         self.clock.start()
 
     def say(self, message: Any) -> None:
@@ -162,7 +161,18 @@ class Hub:
 
     def _finished(self, run: str) -> None:
         """A drive has been recorded: tell all pages."""
-        asyncio.get_running_loop().create_task(self.tell_runs(run))
+        self._begin(self.tell_runs(run))
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        """Have something done beside all else. The loop itself keeps no task alive."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def ready(self) -> None:
+        """Wait until the session is there, so that JAX is set up."""
+        while not self.clock.made.is_set():
+            await asyncio.sleep(0.1)
 
     async def tell_runs(self, new: str = "") -> None:
         """Send the list of runs to all pages; `new` is one that has just come."""
@@ -246,7 +256,7 @@ class Hub:
             return
         answer = self.answer(page)
         if isinstance(message, m.Mark | m.Trim | m.AskGhost | m.DrawCourse):
-            asyncio.get_running_loop().create_task(self._aside(message, answer))
+            self._begin(self._aside(message, answer))
         else:
             self.clock.order(message, answer)
 
@@ -425,7 +435,7 @@ class Cockpit:
         if not self.is_token(request.query_params.get("token", "")):
             return PlainTextResponse("The token is wrong.\n", 403, HEADERS)
         try:
-            await asyncio.to_thread(self.hub.clock.made.wait)
+            await self.hub.ready()
             found = await asyncio.to_thread(get, request.path_params.get("name", ""))
         except (InputError, OSError) as error:
             return PlainTextResponse(f"{str(error)[:300]}\n", 404, HEADERS)
@@ -442,7 +452,7 @@ class Cockpit:
                 words = f"It is over {LARGEST_UPLOAD // 2**20} MB.\n"
                 return PlainTextResponse(words, 413, HEADERS)
         try:
-            await asyncio.to_thread(self.hub.clock.made.wait)
+            await self.hub.ready()
             name = request.query_params.get("name", "")[:200]
             new, remarks = await asyncio.to_thread(self.hub.shelf.take, name, bytes(content))
         except (InputError, OSError) as error:
@@ -467,19 +477,12 @@ class Cockpit:
                 raise InputError("hello: the token is wrong: use the address that was printed")
             self.hub.enter(page, hello)
             while not page.closed:
-                text = await ws.receive_text()
-                if page.is_flood():
-                    await asyncio.sleep(0)
-                    continue
-                try:
-                    self.hub.hear(page, m.parse(text))
-                except InputError as error:
-                    page.complain(str(error))
+                await self._hear(ws, page)
         except InputError as error:  # of the greeting
             with contextlib.suppress(RuntimeError, WebSocketDisconnect):
                 await ws.send_text(m.encode(m.Error(text=str(error)[:300])))
                 await ws.close(1008)
-        except (WebSocketDisconnect, KeyError, RuntimeError):  # gone, or bytes in place of text
+        except (WebSocketDisconnect, KeyError, RuntimeError):  # gone, or greeted with bytes
             pass
         finally:
             self.hub.leave(page)
@@ -488,6 +491,21 @@ class Cockpit:
                 await pump
             with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it is closed
                 await ws.close()
+
+    async def _hear(self, ws: WebSocket, page: Page) -> None:
+        """Take the next message of a page, and answer a wrong one."""
+        try:
+            text = await ws.receive_text()
+        except KeyError:
+            page.complain("message: send text, not bytes")
+            return
+        if page.is_flood():
+            await asyncio.sleep(0)
+            return
+        try:
+            self.hub.hear(page, m.parse(text))
+        except InputError as error:
+            page.complain(str(error))
 
     def is_token(self, given: str) -> bool:
         """Whether a token opens this server."""

@@ -6,7 +6,6 @@ hands do then. What there is to tell comes out of `state` and `told`, as message
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from countersteer.cockpit.gyro import Assist, Hands
 from countersteer.cockpit.recording import Recording
 from countersteer.cockpit.setting import Prepared, Setting
 from countersteer.cockpit.stretch import Said, Stepper
-from countersteer.course.course import place
+from countersteer.course.course import Course, place
 from countersteer.drivers.driver import Heard, Observation
 from countersteer.pilot import PYTHON_PERIOD, bounded, checked
 from countersteer.random_streams import Stream
@@ -51,7 +50,6 @@ class Session:
         self.finished: list[str] = []  # names of the folders that are complete and not told of yet
         self._told: list[Any] = []
         self._recording: Recording | None = None
-        self.who = m.PERSON
         self.rollouts = False
         self.use(prepared)
 
@@ -66,7 +64,7 @@ class Session:
         self._begin()
 
     def reset(self) -> None:
-        """Back to the start, with the car and the floor as they are now."""
+        """Back to the start, with the car and the floor as they are now. The person drives."""
         self.close()
         simulator = set_up.simulator_of(self.setting)
         if self.setting is not self.prepared.setting:
@@ -78,11 +76,12 @@ class Session:
 
     def _begin(self) -> None:
         self._failing_since: dict[str, float] = {}  # s, by sensor
-        self.phase = READY
+        self.phase, self.who = READY, m.PERSON
         self.time = 0.0
         self._pending: list[Record] = []
         self._score: Score = self.prepared.task.init()
-        self._turns, self._touches = 0, [0.0] * 0
+        self._turns = 0
+        self._touches: list[float] = []  # s
         self._contacts = 0
         self._last: Record | None = None
         self._forces = np.zeros((4, 5))
@@ -417,10 +416,10 @@ def rollouts_of(time: float, seen: Any) -> m.Rollouts:
     return m.Rollouts(time_s=time, paths=paths)
 
 
-def goal_of(course: Any, laps: int) -> Sequence[float] | None:
+def goal_of(course: Course, laps: int) -> list[float] | None:
     """The goal's line across the corridor: x, y, x, y (m); None if there is none to draw."""
     if course.goal_distance is None or course.width is None or not len(course.line):
         return None
-    x, y, heading = place(course, course.lap_end(laps))
+    x, y, heading = place(course, course.lap_end(laps) or 0.0)
     aside_x, aside_y = -math.sin(heading) * course.width / 2, math.cos(heading) * course.width / 2
     return [x + aside_x, y + aside_y, x - aside_x, y - aside_y]
