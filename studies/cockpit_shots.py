@@ -1,13 +1,14 @@
-"""Pictures of the cockpit's views, and how fast its page is: `python -m studies.cockpit_shots DIR`.
+"""The cockpit's pictures, or how fast its page is: `python -m studies.cockpit_shots [DIR]`.
 
-A server of this process is driven by real keys in Chromium. Each view becomes a small PNG in DIR:
-light, dark and on a phone. Then the page is measured while it drives: pictures a second, what
-drawing one costs, the time from a key to the first picture of a state that has felt it, and how
-far the car's clock falls behind. Playwright and Pillow are needed (`make browser`).
+A server of this process is driven by real keys in Chromium. With DIR, each view becomes a small PNG
+there: light, dark and on a phone. Without, the page is measured while it drives: pictures a second,
+what drawing one costs, the time from a key to the first picture of a state that has felt it, and
+how far the car's clock falls behind. Playwright and Pillow are needed (`make browser`).
 """
 
 import io
 import json
+import os
 import shutil
 import sys
 import tempfile
@@ -152,8 +153,8 @@ def measured(browser: Browser, address: str) -> dict[str, float]:
     }
 
 
-def main(folder: Path) -> None:
-    """Make the pictures, then print the figures as JSON."""
+def main(folder: Path | None) -> None:
+    """Make the pictures, or print the figures as JSON."""
     with (
         tempfile.TemporaryDirectory() as scratch,
         sync_playwright() as driver,
@@ -164,10 +165,13 @@ def main(folder: Path) -> None:
         browser = driver.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
         )
-        pictures(browser, address, folder)
-        print(json.dumps(measured(browser, address)))
+        if folder is not None:
+            pictures(browser, address, folder)
+        else:
+            load = os.getloadavg()[0]  # others may be at work too
+            print(json.dumps(measured(browser, address) | {"load_average": round(load, 1)}))
         browser.close()
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)

@@ -1,7 +1,6 @@
 // The cockpit: it wires the socket, the hands, the viewer's stage and the panels to each other.
 
-import { indexAt } from "../viewer/drive.js";
-import { definition, element, showChoice } from "../viewer/elements.js";
+import { element, showChoice } from "../viewer/elements.js";
 import { onGestures } from "../viewer/gestures.js";
 import { clamp, signed } from "../viewer/numbers.js";
 import { circlesIn, numbersIn } from "../viewer/panel.js";
@@ -13,12 +12,14 @@ import { Connection } from "./connection.js";
 import { CourseEditor } from "./course_editor.js";
 import { Hands } from "./hands.js";
 import { handsPicture } from "./hands_picture.js";
-import { Lesson, nextCorner } from "./lesson.js";
+import { bindKeys, listKeys } from "./keyboard.js";
+import { Lesson } from "./lesson.js";
 import { LiveDrive } from "./live.js";
 import * as say from "./messages.js";
 import { Meter } from "./meter.js";
 import { Parameters, sensorsIn } from "./parameters.js";
 import { Recordings } from "./recordings.js";
+import { CLOCKS, describe, offerClock, showHolds, showOver, showTurn } from "./telling.js";
 
 const HEARTBEAT = 50;  // ms between inputs when hands rest
 const PANEL = 66, TRACES = 100;  // ms between two pictures of them
@@ -26,9 +27,7 @@ const WINDOW = 8;  // s that the traces show
 const RAMP_END = 60;  // ° of sideslip with the strongest colour
 const LOADED = 1.8;  // the most that a wheel carries, of its load at rest
 const SEEN = 8.5;  // lengths of the car around it, so that a person sees what comes
-const CLOCKS = [0.1, 0.25, 0.5, 1];
-const SAID = 7000, TURN_SHOWN = 3500;  // ms
-const LAGS = 0.25;  // s
+const SAID = 7000;  // ms
 const SPEEDY = 2.5;  // m/s, whose arrow is drawn longest until the car goes faster
 const LEAST = { speed_mps: [0, 3], sideslip_deg: [-40, 40], yaw_rate_degps: [-200, 200],
   steering_deg: [-25, 25], throttle: [0, 100] };
@@ -64,7 +63,11 @@ const connection = new Connection({
     dirty = true;
     lesson.follow(world, message);
   },
-  turn: showTurn,
+  turn(message) {
+    live.summary.turns.push(message);
+    lesson.turned(message);
+    showTurn(message);
+  },
   ended(message) { result = message; },
   runs(message) { recordings.take(message.runs, message.new); },
   ghost(message) {
@@ -206,83 +209,16 @@ part("tabs").addEventListener("keydown", (event) => {
   openTab(next.getAttribute("aria-controls"));
 });
 
-function showTurn(turn) {
-  live.summary.turns.push(turn);
-  lesson.turned(turn);
-  const [angle, far] = [signed(turn.peak_sideslip_deg, 0), signed(turn.heading_overshoot_deg, 0)];
-  const title = turn.touched ? `Turn ${turn.number}: wall touched`
-    : turn.drift ? `Turn ${turn.number}: drift, ${angle}°` : `Turn ${turn.number}: grip, ${angle}°`;
-  const detail = `turned ${far}° too far, in at ${signed(turn.entry_speed_mps, 1)} m/s, `
-    + `${signed(turn.duration_s, 1)} s`;
-  const banner = part("banner"), last = part("last-turn");
-  banner.replaceChildren(title);
-  banner.className = `turn-banner ${turn.touched ? "bad" : turn.drift ? "good" : ""}`;
-  element(banner, "small", {}, detail);
-  clearTimeout(showTurn.timer);
-  showTurn.timer = setTimeout(() => banner.replaceChildren(), TURN_SHOWN);
-  last.replaceChildren();
-  Object.assign(last.dataset, { turn: turn.number, drift: turn.drift, touched: turn.touched,
-    sideslip: turn.peak_sideslip_deg });
-  element(last, "b", { class: turn.touched ? "bad" : turn.drift ? "good" : "" }, title);
-  element(last, "p", {}, detail);
-}
-
-/** What lies over the stage: why the car does not move, and what to do. */
-function showOver() {
-  const { state } = live, box = part("over"), drives = role === "drives";
-  let [title, hint] = ["", ""];
-  if (role === "lost") [title, hint] = ["No server", "The page tries again by itself."];
-  else if (busy) [title, hint] = [busy, "It takes a while the first time."];
-  else if (editor.active || !state) title = "";
-  else if (state.phase === "paused") [title, hint] = ["Paused", drives ? "Space goes on" : ""];
-  else if (state.phase === "ended" && result) {
-    const lap = result.lap_time_s === null ? "" : ` in ${result.lap_time_s.toFixed(2)} s`;
-    title = result.verdict + (result.success ? lap : "");
-    hint = `${result.drifts} of ${result.turns} turns drifting. ${drives ? "R: again" : ""}`;
-  } else if (state.phase === "ready" && drives && part("lesson").hidden) {
-    [title, hint] = ["Ready", "Hold ↑ to drive, or H for the driver"];
-  }
-  const words = `${title}\n${hint}`;
-  if (box.dataset.words === words) return;
-  box.dataset.words = words;
-  box.hidden = !title;
-  box.replaceChildren(title);
-  element(box, "small", {}, hint);
-}
-
-/** What holds now, in the corner of the stage. */
-function showHolds(state) {
-  const now = [];
-  if (state.who === "driver") now.push(["released", `${world?.driver ?? "the driver"} drives`]);
-  if (state.silent && state.phase === "drives" && state.who === "person") {
-    now.push(["lost", "nothing heard from the driver’s page: throttle cut"]);
-  }
-  if (state.touching) now.push(["fault", "wall"]);
-  if (state.rate < 1) now.push(["lost", `clock ${state.rate}×`]);
-  const words = now.map(([, text]) => text).join("\n"), box = part("events");
-  if (box.dataset.words !== words) {
-    box.dataset.words = words;
-    box.replaceChildren();
-    for (const [kind, text] of now) element(box, "span", { class: `event ${kind}` }, text);
-  }
-  // A machine that cannot keep the clock is offered a slower one.
-  const slower = CLOCKS.filter((one) => one < Math.min(state.rate, state.keeps)).at(-1) ?? 0.1;
-  const lags = state.phase === "drives" && state.lag_s > LAGS && state.rate > 0.1;
-  if (lags && part("offer").hidden) {
-    part("offer-text").textContent = `This machine is ${signed(state.lag_s, 1)} s behind: it keeps `
-      + `${signed(state.keeps, 2)}× of real time.`;
-    part("offer-take").textContent = `Use ${slower}×`;
-    part("offer-take").value = slower;
-    part("offer").hidden = false;
-  } else if (!lags && state.lag_s < LAGS / 2) part("offer").hidden = true;
-}
+const tellOver = () =>
+  showOver({ state: live.state, role, busy, result, draws: editor.active });
 
 function showState(state, moment) {
   showNumbers(moment);
   showCircles(moment);
   showHands(hands.read(), state);
-  showHolds(state);
-  showOver();
+  showHolds(state, world?.driver ?? "the driver");
+  offerClock(state);
+  tellOver();
   const words = { ready: "Go", drives: "Pause", paused: "Go on", ended: "Again" };
   part("pause").firstElementChild.textContent = words[state.phase];
   part("hand-over").firstElementChild.textContent =
@@ -296,18 +232,6 @@ function showState(state, moment) {
     + `from key to picture, lag ${signed(1000 * state.lag_s, 0)} ms`;
 }
 
-/** The same as the picture, for who reads the page without seeing it. */
-function describe(state, moment) {
-  const corner = world && nextCorner(world, state);
-  Object.assign(stage.canvas.dataset, {
-    time: state.time_s, phase: state.phase, x: moment.x.toFixed(3), y: moment.y.toFixed(3),
-    heading: (moment.heading * 180 / Math.PI).toFixed(1), speed: signed(moment.speed, 2),
-    sideslip: moment.sideslip.toFixed(1), yawRate: moment.yawRate.toFixed(0),
-    course: world?.course ?? "", car: world?.car ?? "", who: state.who, contacts: state.wall_contacts, throttle: state.throttle,
-    corner: corner ? corner.away.toFixed(2) : "", side: corner?.side ?? "",
-  });
-}
-
 // ---- the picture ----
 
 function frame() {
@@ -318,17 +242,17 @@ function frame() {
   if (editor.active) {
     if (dirty) editor.draw(stage.size, live.car);
     dirty = false;
-    showOver();
+    tellOver();
     return;
   }
   if (!dirty && !moves) return;
   dirty = false;
-  if (!state || !live.time_s.length) { showOver(); return; }
+  if (!state || !live.time_s.length) { tellOver(); return; }
   const moment = live.moment(begin / 1000);
   stage.fastest = Math.max(stage.fastest, Math.abs(moment.speed));
   stage.patches = brush.shown();
   stage.draw([moment], 0);
-  describe(state, moment);
+  describe(stage.canvas, world, state, moment);
   if (begin - panelAt > PANEL || !moves) {
     panelAt = begin;
     showState(state, moment);
@@ -420,39 +344,16 @@ function handOver() {
   send(say.handOver({ to: live.state?.who === "person" ? "driver" : "person" }));
 }
 
-/** Whether an element uses keys itself, so that they are not the car's. */
-function usesKeys(target) {
-  if (target.closest?.("dialog, [role=tablist]")) return true;
-  return target.matches?.("select, textarea, input:not([type=checkbox], [type=file])") ?? false;
-}
-
-document.addEventListener("keydown", (event) => {
-  const { key, target } = event;
-  if (key === "Escape" && usesKeys(target)) target.blur();
-  if (usesKeys(target)) return;
-  if (editor.active && editor.key(event)) { event.preventDefault(); return; }
-  if (event.ctrlKey || event.metaKey || event.altKey) return;
-  if (brush.on && live.time_s.length && brush.key(key, [live.x_m.at(-1), live.y_m.at(-1)])) {
-    event.preventDefault();
-    dirty = true;
-    return;
-  }
-  if (hands.press(event.code)) { event.preventDefault(); return; }
-  // Space and Enter press the button that has the focus, as everywhere.
-  if ((key === " " || key === "Enter") && target.closest("button, a, summary, label")) return;
-  const action = ACTIONS.get(key.toLowerCase());
-  if (!action || event.repeat && key !== ".") return;
-  event.preventDefault();
-  action[2]();
+bindKeys(ACTIONS, {
+  commands: (event) => editor.active && editor.key(event),
+  drives({ key, code }) {
+    if (brush.on && live.time_s.length && brush.key(key, [live.x_m.at(-1), live.y_m.at(-1)])) {
+      dirty = true;
+      return true;
+    }
+    return hands.press(code);
+  },
 });
-// What was set with the pointer gives the keys back to the car; who came by the keyboard stays.
-let byPointer = false;
-addEventListener("pointerdown", () => { byPointer = true; }, true);
-addEventListener("keydown", () => { byPointer = false; }, true);
-const giveBack = (event) => {
-  if (byPointer && event.target.matches("select, input[type=range], button")) event.target.blur();
-};
-for (const name of ["change", "click"]) addEventListener(name, giveBack);
 
 // ---- buttons ----
 
@@ -550,20 +451,7 @@ onGestures(stage.canvas, {
 
 // ---- the page itself ----
 
-for (const [name, does, , short] of [["↑ ↓ ← →", "drive; W A S D as well", null, true],
-  ...ACTIONS.values()]) {
-  const { value, number } = definition(part("key-table"), "", "");
-  value.parentNode.firstElementChild.append(...name.split(" ").map((one) => {
-    const cap = document.createElement("kbd");
-    cap.textContent = one;
-    return cap;
-  }));
-  number.data = does;
-  if (!short) continue;
-  const item = element(part("keys-line"), "span");
-  for (const one of name.split(" ")) element(item, "kbd", {}, one);
-  item.append(` ${does.split(/[:,;]/)[0]}`);
-}
+listKeys(part("key-table"), part("keys-line"), ACTIONS);
 element(part("keys-line"), "span", { class: "space" });
 element(part("keys-line"), "output", { id: "meter" });
 part("ramp-end").textContent = `${RAMP_END}°`;

@@ -1,7 +1,9 @@
 // The first visit: to a drift, one sentence of help at a time.
 
 const DONE = "countersteer-lesson";
-const NEAR = 1.15, DRIFTS = 15;  // m before the corner; ° of sideslip at which the tail is out
+// m before the corner at which the next sentence comes, so that it is read in time; ° of sideslip at
+// which the tail is out.
+const NEAR = 1.5, DRIFTS = 15;
 
 /** Distance (m) from the car to the next corner of the centre line, and the key towards it. */
 export function nextCorner(world, state) {
@@ -20,7 +22,7 @@ export function nextCorner(world, state) {
 }
 
 const TOUCH = matchMedia("(pointer: coarse)").matches;
-const GAS = TOUCH ? "the right pad up" : "↑ (or W)";
+const GAS = TOUCH ? "the right pad" : "↑ (or W)";
 const SIDES = TOUCH ? { left: "the left pad to the left", right: "the left pad to the right" }
   : { left: "← (or A)", right: "→ (or D)" };
 
@@ -66,10 +68,10 @@ export class Lesson {
 
   show() {
     const key = SIDES[this.side];
-    const words = [`Press ${GAS} and hold it: the car drives off.`,
+    const words = [`Press ${GAS}${TOUCH ? " up" : ""} and hold it: the car drives off.`,
       `Keep holding ${GAS} until the car comes to the corner.`,
-      `Now hold ${key} as well: the tail swings out.`,
-      `That is a drift! Let go of ${key} when the nose points down the next straight.`,
+      `Now let go of ${GAS} and hold ${key}: the tail swings out.`,
+      `That is a drift! Let go of ${key} before the nose points down the next straight.`,
       "You drifted a corner! Go on, or press R for a new start. Each drive is recorded: see Runs.",
       `That was the wall. Press ${TOUCH ? "Reset" : "R"} and steer into the corner a little sooner.`,
     ][this.step];
