@@ -23,7 +23,7 @@ from countersteer.cockpit.server import running
 from countersteer.cockpit.start import Start, cockpit
 
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
-COLOURS = 256  # of a picture, so that it stays small
+LARGEST = 150_000  # bytes of a picture; a larger one gets fewer colours
 PATIENCE = 600.0  # s for a first start, in which programs are compiled
 MEASURED = 20.0  # s
 TAPS = 40  # of a key
@@ -54,7 +54,9 @@ def kept(page: Page, file: Path) -> None:
     """Keep what the page shows as a small picture."""
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     file.parent.mkdir(parents=True, exist_ok=True)
-    picture.quantize(COLOURS, dither=Image.Dither.NONE).save(file, optimize=True)
+    picture.save(file, optimize=True)
+    if file.stat().st_size > LARGEST:
+        picture.quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
 
 
 def driven(page: Page, seconds: float) -> None:

@@ -111,7 +111,7 @@ SEEN = "({ ...document.getElementById('stage').dataset })"
 TURN = "({ ...document.getElementById('last-turn').dataset })"
 
 
-def until(page: Any, holds: str, seconds: float = 20) -> None:
+def until(page: Any, holds: str, seconds: float = 60) -> None:
     """Wait until a JavaScript expression holds. The page forbids Playwright's own way."""
     end = time.monotonic() + seconds
     while not page.evaluate(f"Boolean({holds})"):
@@ -165,7 +165,7 @@ def page(driving: Any) -> Any:
     """The page that drives, with its car at the start and the panel of the drive."""
     for key in ("ArrowUp", "ArrowLeft", "ArrowRight"):
         driving.keyboard.up(key)
-    until(driving, role_is("drives"), 10)
+    until(driving, role_is("drives"))
     driving.click("#tab-now")
     driving.keyboard.press("r")
     until(driving, phase_is("ready"))
@@ -438,7 +438,7 @@ def test_silence_of_the_page_cuts_the_throttle_within_200_ms_and_so_does_its_end
     closed = watcher.evaluate(TIME)
     until(watcher, f"{TIME} > {closed} + 0.2")
     assert watcher.evaluate(THROTTLE) == 0
-    until(watcher, role_is("drives"), 15)
+    until(watcher, role_is("drives"))
     watcher.keyboard.press("r")
     watcher.click("#tab-runs")
     until(watcher, "document.querySelector('#run-list [data-run] small')")

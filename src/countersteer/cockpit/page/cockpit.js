@@ -19,7 +19,9 @@ import * as say from "./messages.js";
 import { Meter } from "./meter.js";
 import { Parameters, sensorsIn } from "./parameters.js";
 import { Recordings } from "./recordings.js";
-import { CLOCKS, describe, offerClock, showHolds, showOver, showTurn } from "./telling.js";
+import {
+  CLOCKS, clearTurn, describe, offerClock, showHolds, showOver, showTurn,
+} from "./telling.js";
 
 const HEARTBEAT = 50;  // ms between inputs when hands rest
 const PANEL = 66, TRACES = 100;  // ms between two pictures of them
@@ -59,7 +61,7 @@ const connection = new Connection({
   },
   world: takeWorld,
   state(message) {
-    live.add(message, performance.now() / 1000);
+    if (live.add(message, performance.now() / 1000)) clearTurn();
     dirty = true;
     lesson.follow(world, message);
   },
@@ -69,7 +71,10 @@ const connection = new Connection({
     showTurn(message);
   },
   ended(message) { result = message; },
-  runs(message) { recordings.take(message.runs, message.new); },
+  runs(message) {
+    recordings.take(message.runs, message.new);
+    showRole();
+  },
   ghost(message) {
     stage.companions = message.time_s.length ? [{ ...message, car: live.car, walls_m: [] }] : [];
     if (message.time_s.length) tell(`The ghost is ${message.name}.`);
@@ -122,9 +127,8 @@ function fillMenu(menu, items, chosen) {
 }
 
 function takeWorld(message) {
-  const another = !world || JSON.stringify(world.walls_m) !== JSON.stringify(message.walls_m);
+  const another = live.take(message);
   world = message;
-  live.take(world);
   fillMenu(part("course"), world.courses, world.course);
   fillMenu(part("car"), world.cars, world.car);
   fillMenu(part("driver"), world.drivers, world.driver);
@@ -144,13 +148,10 @@ function takeWorld(message) {
     limit = LOADED * world.limit_n;
     showCircles = circlesIn(part("circles"), live, limit);
   }
-  if (another) {
-    stage.companions = [];
-    if (live.state) live.clear();
-  }
+  if (another) stage.companions = [];
   stage.measure();
   Object.assign(stage, { fastest: Math.max(stage.fastest, SPEEDY), limit, goal: world.goal_m });
-  dirty = true;
+  showRole();
 }
 
 let sayTimer = 0;

@@ -26,11 +26,12 @@ export class LiveDrive {
     this.clear();
   }
 
-  /** Another course or car. */
+  /** The course and the car; returns whether the course is another, or the car's sensors are. */
   take(world) {
-    this.walls_m = world.walls_m;
-    this.car = world.outline;
-    this.mounts = world.sonar;
+    const place = JSON.stringify([world.walls_m, world.sonar]), another = place !== this.place;
+    Object.assign(this, { place, walls_m: world.walls_m, car: world.outline, mounts: world.sonar });
+    if (another) this.clear();
+    return another;
   }
 
   /** Forget what was driven. */
@@ -45,13 +46,14 @@ export class LiveDrive {
 
   get estimate() { return this.guesses.time_s.length ? this.guesses : null; }
 
-  /** Add a state that came at `now` (s of the page's clock). */
+  /** Add a state that came at `now` (s of the page's clock); returns whether a drive began anew. */
   add(state, now) {
-    if (this.state && state.time_s < this.state.time_s) this.clear();
+    const anew = Boolean(this.state) && state.time_s < this.state.time_s;
+    if (anew) this.clear();
     const known = this.time_s.length && state.time_s <= endOf(this);
     this.state = state;
     this.follow(state, now);
-    if (known) return;
+    if (known) return anew;
     push(this, SERIES, state);
     this.wheels.forEach((wheel, k) => push(wheel, OF_WHEEL, state.wheels[k]));
     this.sonar.forEach((sonar, k) => {
@@ -64,6 +66,7 @@ export class LiveDrive {
       push(this.guesses, BELIEVED, state.estimate);
     }
     if (beginOf(this) < state.time_s - KEPT - SLACK) this.forget(state.time_s - KEPT);
+    return anew;
   }
 
   forget(before) {

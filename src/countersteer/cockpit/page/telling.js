@@ -31,6 +31,13 @@ export function showTurn(turn) {
   element(last, "p", {}, detail);
 }
 
+/** A new drive has no last turn. */
+export function clearTurn() {
+  const last = part("last-turn");
+  last.replaceChildren();
+  for (const name of Object.keys(last.dataset)) delete last.dataset[name];
+}
+
 /** What lies over the stage: why the car does not move, and what to do. */
 export function showOver({ state, role, busy, result, draws }) {
   const box = part("over"), drives = role === "drives";
