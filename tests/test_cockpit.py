@@ -334,7 +334,7 @@ class Client:
     def until(self, kind: str, holds: Callable[[Any], bool] = lambda _: True) -> Any:
         """The first message of a kind that holds, among the next thousand."""
         for _ in range(1000):
-            found = json.loads(self.socket.recv(timeout=60))
+            found = json.loads(self.socket.recv(timeout=120))
             if found["kind"] == kind and holds(found):
                 return found
         raise AssertionError(f"no {kind} came")
@@ -388,12 +388,14 @@ def test_a_page_drives_the_car_and_its_input_comes_back(page):
 
 
 def test_a_silent_page_loses_its_throttle_within_200_ms(page):
-    state = page.throttle(0.3)
-    assert state["throttle"] > 0
+    page.throttle(0.3)
+    page.input(throttle=1.0)
+    felt = page.until("state", lambda s: s["seq"] == page.seq)
+    assert felt["throttle"] > 0
     quiet = page.until("state", lambda s: s["silent"])
     assert quiet["throttle"] == 0
-    # The clock of the car is not that of the wall, but it is never ahead of it.
-    assert quiet["time_s"] - state["time_s"] < 0.2 + 0.03
+    # The car's clock goes ahead of the wall's only where it catches up; a state comes each 20 ms.
+    assert quiet["time_s"] - felt["time_s"] < SILENCE + 0.04 + felt["lag_s"]
     assert SILENCE < 0.2
     page.input(throttle=1.0)
     page.until("event", lambda e: e["what"] == "heard")
