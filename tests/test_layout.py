@@ -65,6 +65,10 @@ MAY_IMPORT = {
         "car", "runs", "task", "world",  # a car is drawn to its size, with its forces
         "batch", "tuning",  # what came of trials and of fits
     },
+    "cockpit": {  # a person in place of a driver, and the report's viewer live
+        "car", "course", "world", "sensing", "link", "estimation", "drivers", "pilot", "simulator",
+        "task", "runs", "recorded_drive", "viewing",
+    },
     "cli": None,
     "api": None,  # what `import countersteer` gives
     "__init__": None,

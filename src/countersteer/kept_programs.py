@@ -47,7 +47,8 @@ class Kept:
     """A pure function, as `jax.jit` would have it; `static` are the positions of static arguments.
 
     Under a trace it is the function itself. A program is kept only if every class in the arguments
-    is of this package: nothing else is known to change its source when it changes.
+    is of this package: nothing else is known to change its source when it changes. So it is with
+    structures of trees among the static arguments.
     """
 
     def __init__(self, function: Callable[..., Any], static: Sequence[int] = ()) -> None:
@@ -89,7 +90,7 @@ class Kept:
         with self._lock:
             if signature not in self._programs:
                 made = None
-                if _own(tree):
+                if _own(tree) and all(map(_own, _trees(static))):
                     name = f"{self.function.__module__}.{self.function.__qualname__}"
                     versions = (FORMAT, source(), jax.__version__, jax.lib.__version__)
                     typed = tuple((shape, str(dtype)) for shape, dtype in types)
@@ -306,6 +307,15 @@ def _own(tree: Any) -> bool:
         if module != "builtins" and module.partition(".")[0] != PACKAGE:
             return False
     return all(_own(child) for child in tree.children())
+
+
+def _trees(static: Any) -> Iterator[Any]:
+    """The structures of trees among static arguments, which may be tuples."""
+    if isinstance(static, tuple):
+        for part in static:
+            yield from _trees(part)
+    elif isinstance(static, jax.tree_util.PyTreeDef):
+        yield static
 
 
 def _described(tree: Any) -> Any:

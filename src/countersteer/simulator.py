@@ -90,6 +90,7 @@ class Simulator:
     charge: Scalar  # of the battery
     seed: Scalar
     faults: tuple[SensorFault, ...]
+    loss: Scalar  # chance that the radio loses a packet
     link: Link = dataclasses.field(metadata={"static": True})
     every: all_sensors.Periods = dataclasses.field(metadata={"static": True})
     slots: int = dataclasses.field(metadata={"static": True})  # poses kept for the position's delay
@@ -128,6 +129,7 @@ class Simulator:
             charge=charge,
             seed=np.int32(seed),
             faults=cast(faults),
+            loss=dtype.type(link.loss),
             link=link,
             every=all_sensors.periods(car, dt),
             slots=all_sensors.position_slots(car, dt),
@@ -237,7 +239,7 @@ def advance(
     up, down = loop.up, loop.down
     if up is not None:
         key = random_streams.key(root, Stream.LINK, tick)
-        lost = jax.random.uniform(key, (2,)) < simulator.link.loss
+        lost = jax.random.uniform(key, (2,)) < simulator.loss
         up = exchange(up, command, lost[0], tick, link.control, link.delay)
         fresh = up.arrived == tick
         silent = tick - up.arrived > link.timeout

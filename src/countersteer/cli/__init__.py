@@ -15,6 +15,7 @@ from countersteer import __version__
 from countersteer.cache import cache_folder
 from countersteer.cli import (
     bench,
+    cockpit,
     completing,
     drive,
     evaluate,
@@ -47,8 +48,8 @@ from countersteer.writing import clean_up, naming
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "WRONG_INPUT", "Progress", "entry", "main"]
 
 VERBS = (
-    drive, evaluate, replay, importing, report, trials, experiment, learn, tune, export, bench,
-    listing, new, completing,
+    drive, cockpit, evaluate, replay, importing, report, trials, experiment, learn, tune, export,
+    bench, listing, new, completing,
 )  # fmt: skip
 
 

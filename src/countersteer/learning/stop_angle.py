@@ -6,17 +6,31 @@ from pathlib import Path
 import numpy as np
 
 from countersteer.drivers.policy import save_policy
+from countersteer.errors import InputError
 from countersteer.experiments.open_turns import read_turns
 from countersteer.experiments.stop_regression import Stops, about, regress_stops
 from countersteer.runs.files import Table
+from countersteer.runs.marks import BAD, FILE, read_mark
 from countersteer.text import counted
 
 
 def learn(sources: Sequence[Path], most: float, out: Path) -> Stops:
-    """Learn from tables of turns or runs, and write the policy. `most` is as in `regress_stops`."""
+    """Learn from tables of turns or runs, and write the policy. `most` is as in `regress_stops`.
+
+    Runs that a person has marked bad are left out.
+    """
+    sources = without_bad(sources)
     found = regress_stops(read_all(sources), most)
     save_policy(out, source(found, [path.name for path in sources]), stop_angle=found.stop_angle)
     return found
+
+
+def without_bad(sources: Sequence[Path]) -> list[Path]:
+    """The sources without runs that are marked bad. Raises `InputError` if none is left."""
+    left = [path for path in sources if not (path.is_dir() and read_mark(path) == BAD)]
+    if sources and not left:
+        raise InputError(f"{sources[0]}: is marked bad ({FILE}), as are all others that were given")
+    return left
 
 
 def read_all(paths: Sequence[Path]) -> Table:

@@ -92,6 +92,10 @@ _DISTANCE, _LAG = _number(-FARTHEST, FARTHEST), _number(0, 10)
 _ARM = _number(-5, 5)  # m, within a car
 _POINT = _list(_DISTANCE, 2)
 _WAVE = {key: _number(-FARTHEST, FARTHEST) for key in ("x_radpm", "y_radpm", "phase_rad")}
+_PATCH = {
+    "x_m": _number(-FARTHEST, FARTHEST), "y_m": _number(-FARTHEST, FARTHEST),
+    "radius_m": _number(1e-3, FARTHEST), "friction": _number(0.01, 10),
+}  # fmt: skip
 
 _COURSE = Keys(
     {
@@ -171,6 +175,7 @@ ABOUT = Keys(
             {
                 "amplitude": _number(-1, 1),
                 "waves": _list(Keys(_WAVE, tuple(_WAVE))),
+                "patches": _list(Keys(_PATCH, tuple(_PATCH))),
             },
             ("amplitude", "waves"),
         ),

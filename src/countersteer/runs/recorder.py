@@ -62,8 +62,8 @@ class Frames(NamedTuple):
 
 
 @contextlib.contextmanager
-def new_folder(out: Path | None, name: str) -> Iterator[Path]:
-    """Make an empty folder for results: `out`, or else a numbered one under `runs/`.
+def new_folder(out: Path | None, name: str, parent: Path = Path("runs")) -> Iterator[Path]:
+    """Make an empty folder for results: `out`, or else a numbered one in `parent`.
 
     No other process of this program writes there until the block ends. An existing result is kept
     under another name, with the next free number. If the block raises an exception and nothing was
@@ -71,7 +71,7 @@ def new_folder(out: Path | None, name: str) -> Iterator[Path]:
     folder holds something other than a result, or if it cannot be made.
     """
     with contextlib.ExitStack() as stack:
-        folder = _numbered(Path("runs"), name, stack) if out is None else _made(out, stack)
+        folder = _numbered(parent, name, stack) if out is None else _made(out, stack)
         try:
             yield folder
         except BaseException:

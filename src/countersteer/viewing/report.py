@@ -9,7 +9,7 @@ import numpy as np
 
 from countersteer.viewing.page import filled
 from countersteer.viewing.side_by_side import differences
-from countersteer.viewing.viewer import bundle
+from countersteer.viewing.viewer import FOLDER, bundle
 
 # The steps to which series are rounded: what can be seen on the page. Finer ones make it larger.
 _STEPS = {
@@ -46,20 +46,26 @@ def report_html(*views: dict[str, Any]) -> str:
     Several are side by side: at the same time or, `with_places`, at the same place along the first
     one's path. Texts of the views are shown as text, whatever they contain.
     """
+    data = report_json(*views)
+    title = " and ".join(str(run["title" if len(views) == 1 else "name"]) for run in views)
+    fields = {
+        "title": html.escape(title),
+        # No "<" at all is left, so nothing in the data can end the script element around it.
+        "view": data.replace("<", "\\u003c"),
+        "viewer_style": (FOLDER / "viewer.css").read_text(encoding="utf-8").rstrip(),
+        "viewer": bundle("report.js"),
+    }
+    return filled("report_template.html", fields)
+
+
+def report_json(*views: dict[str, Any]) -> str:
+    """The data of that page: the runs, and the differences of all from the first."""
     runs = [dict(view) for view in views]
     for run in runs:
         run["wheels"] = [_wheel(wheel) for wheel in run["wheels"]]
     compared = {by: list(differences(views, by)) for by in ("time", "place")}
     shown = {"runs": _plain("runs", runs), "differences": _plain("differences", compared)}
-    data = json.dumps(shown, separators=(",", ":"), allow_nan=False)
-    title = " and ".join(str(run["title" if len(runs) == 1 else "name"]) for run in runs)
-    fields = {
-        "title": html.escape(title),
-        # No "<" at all is left, so nothing in the data can end the script element around it.
-        "view": data.replace("<", "\\u003c"),
-        "viewer": bundle("report.js"),
-    }
-    return filled("report_template.html", fields)
+    return json.dumps(shown, separators=(",", ":"), allow_nan=False)
 
 
 def _wheel(wheel: dict[str, Any]) -> dict[str, Any]:

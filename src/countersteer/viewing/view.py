@@ -60,7 +60,7 @@ def view_of(run: Run) -> dict[str, Any]:
         "facts": facts(run),
         "summary": UNJUDGED | {"outcome": run.outcome} | _unfinished(run, time) | run.summary,
         "walls_m": course.get("walls_m", []),
-        "car": _outline(car),
+        "car": outline(car),
         "sonar": echoes(run, car) if course else [],
         "wheels": wheel_views(car, motions(run, car), floor_of_run(run.about), every)
         if simulated
@@ -176,7 +176,7 @@ def _measured(run: Run, car: Car) -> dict[str, np.ndarray]:
     return {name: np.where(np.abs(v) <= LARGEST, v, math.nan) for name, v in shown.items()}
 
 
-def _outline(car: Car) -> dict[str, Any]:
+def outline(car: Car) -> dict[str, Any]:
     """The size of a car, and the places of its wheels."""
     body, tires = car.body, planar.tires_by_wheel(car)
     return {
@@ -279,25 +279,30 @@ def warm_up(car: Car, floor: Floor | None = None) -> None:
 
 def echoes(run: Run, car: Car) -> list[dict[str, Any]]:
     """The reports of each sonar that reported, with their times (s). No echo is infinite."""
-    sonar, found = car.sensors.sonar, []
+    found = []
     table = run.telemetry if run.telemetry is not None else Table()
-    for name, mount in zip(sonar.mount_names, sonar.mounts, strict=True):
-        heard = table.get(f"sonar_{name}_m", np.zeros(0))
+    for mount in mounts(car):
+        heard = table.get(f"sonar_{mount['name']}_m", np.zeros(0))
         told = ~np.isnan(heard)
         if not np.any(told):
             continue
-        found.append(
-            {
-                "name": name,
-                "x_m": float(mount.x),
-                "y_m": float(mount.y),
-                "angle_deg": math.degrees(mount.angle),
-                "half_angle_deg": math.degrees(sonar.half_angle),
-                "time_s": table["time_s"][told],
-                "distance_m": heard[told],
-            }
-        )
+        found.append(mount | {"time_s": table["time_s"][told], "distance_m": heard[told]})
     return found
+
+
+def mounts(car: Car) -> list[dict[str, Any]]:
+    """Name, place and cone of each sonar of a car."""
+    sonar = car.sensors.sonar
+    return [
+        {
+            "name": name,
+            "x_m": float(mount.x),
+            "y_m": float(mount.y),
+            "angle_deg": math.degrees(mount.angle),
+            "half_angle_deg": math.degrees(sonar.half_angle),
+        }
+        for name, mount in zip(sonar.mount_names, sonar.mounts, strict=True)
+    ]
 
 
 def motions(run: Run, car: Car) -> Motion:

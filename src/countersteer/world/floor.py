@@ -1,4 +1,4 @@
-"""The floor: friction that varies with position, as a sum of waves."""
+"""The floor: friction that varies with position, as a sum of waves and of painted discs."""
 
 import math
 from collections.abc import Mapping
@@ -14,6 +14,8 @@ from countersteer.signals import Motion, Scalar, Wheels
 from countersteer.world.angle import cosine, cosine_sine
 
 KEYS = ("x_radpm", "y_radpm", "phase_rad")  # keys of a wave in files
+PATCH_KEYS = ("x_m", "y_m", "radius_m", "friction")  # of a disc
+FADES = 4.0  # the outer quarter of a disc's area fades
 WAVES = 8
 LARGEST = 0.95 / math.sqrt(2 * WAVES)  # deviation up to which friction is positive everywhere
 
@@ -26,11 +28,25 @@ class Wave(NamedTuple):
     phase: Scalar  # at the origin, rad
 
 
+class Patch(NamedTuple):
+    """A disc with a factor on the friction. Towards its rim the factor fades to 1."""
+
+    x: Scalar  # of its centre, m
+    y: Scalar
+    radius: Scalar  # m
+    factor: Scalar
+
+
 class Floor(NamedTuple):
-    """Factor on the tyres' friction at a position p: 1 + amplitude · Σ cos(wave · p + phase)."""
+    """Factor on the tyres' friction at a position p: that of the waves times that of each disc.
+
+    The waves give 1 + amplitude · Σ cos(wave · p + phase). A disc of radius R and factor f gives
+    1 + (f − 1) · w at a distance d from its centre, with w = `FADES` · (1 − d²/R²) within [0, 1].
+    """
 
     waves: tuple[Wave, ...]
     amplitude: Scalar
+    patches: tuple[Patch, ...] = ()
 
 
 def draw(key: jax.Array, deviation: Scalar = 0.1, length: Scalar = 0.5) -> Floor:
@@ -54,7 +70,11 @@ def draw(key: jax.Array, deviation: Scalar = 0.1, length: Scalar = 0.5) -> Floor
 def friction(floor: Floor, x: Scalar, y: Scalar) -> Scalar:
     """Factor on the tyres' friction at a position x, y (m)."""
     total = sum(cosine(w.x * x + w.y * y + w.phase) for w in floor.waves)
-    return 1 + floor.amplitude * total
+    factor = 1 + floor.amplitude * total
+    for patch in floor.patches:
+        apart = ((x - patch.x) ** 2 + (y - patch.y) ** 2) / patch.radius**2
+        factor *= 1 + (patch.factor - 1) * jnp.clip(FADES * (1 - apart), 0.0, 1.0)
+    return factor
 
 
 def under_wheels(
@@ -80,7 +100,13 @@ def under_wheels(
 def floor_tables(floor: Floor) -> dict[str, Any]:
     """A floor as plain data, for `run.toml`."""
     waves = [dict(zip(KEYS, map(float, wave), strict=True)) for wave in floor.waves]
-    return {"amplitude": float(floor.amplitude), "waves": waves}
+    tables: dict[str, Any] = {"amplitude": float(floor.amplitude), "waves": waves}
+    painted = [patch for patch in floor.patches if patch.factor != 1]
+    if painted:
+        tables["patches"] = [
+            dict(zip(PATCH_KEYS, map(float, patch), strict=True)) for patch in painted
+        ]
+    return tables
 
 
 def floor_of_run(about: Mapping[str, Any]) -> Floor | None:
@@ -90,6 +116,10 @@ def floor_of_run(about: Mapping[str, Any]) -> Floor | None:
         return None
     try:
         waves = tuple(Wave(*(np.float64(wave[key]) for key in KEYS)) for wave in tables["waves"])
-        return Floor(waves, np.float64(tables["amplitude"]))
+        patches = tuple(
+            Patch(*(np.float64(patch[key]) for key in PATCH_KEYS))
+            for patch in tables.get("patches", ())
+        )
+        return Floor(waves, np.float64(tables["amplitude"]), patches)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"run.toml: [floor] is not as it was written: {error}") from None

@@ -58,7 +58,7 @@ export class ChaseCamera {
  */
 export class CameraRig {
   constructor(mode = "follow") {
-    this.mode = mode;
+    Object.assign(this, { mode, lengths: 4.8 });  // of the car, that are seen around it
     this.reset();
   }
 
@@ -87,7 +87,7 @@ export class CameraRig {
       return new TopCamera((bounds.left + bounds.right) / 2 + this.x,
         (bounds.low + bounds.high) / 2 + centre / whole + this.y, scale, size);
     }
-    const scale = Math.max(whole, Math.min(size.width, size.height) / (4.8 * car.length_m))
+    const scale = Math.max(whole, Math.min(size.width, size.height) / (this.lengths * car.length_m))
       * this.zoom;
     // The camera stops at the edge of the course, as there is nothing to see beyond it.
     const stop = (at, low, high, half) =>

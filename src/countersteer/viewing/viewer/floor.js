@@ -49,6 +49,22 @@ export function drawGrid(pen, theme, size, moment, car) {
   c.fillText("x, m", size.width - 160, foot);
 }
 
+/** Discs of floor with another friction: slippery ones blue, grippy ones dark; the rim is faint. */
+export function drawPatches(pen, patches, theme) {
+  for (const { x_m, y_m, radius_m, friction } of patches) {
+    const colour = theme.colour(friction < 1 ? "velocity" : "skid");
+    const alpha = 0.05 + 0.25 * Math.min(Math.abs(Math.log2(friction)), 1);
+    for (const part of [1, 0.7]) pen.begin().arc(x_m, y_m, part * radius_m).fill(colour, alpha);
+  }
+}
+
+/** The goal's line: x, y of both ends. */
+export function drawGoal(pen, goal, theme) {
+  const [x0, y0, x1, y1] = goal;
+  pen.begin().move(x0, y0).to(x1, y1)
+    .stroke(theme.colour("good"), { wide: 4, dash: [7, 6], cap: "butt", alpha: 0.8 });
+}
+
 export function drawWalls(pen, walls, theme, car) {
   const colour = theme.colour("wall"), height = WALL_HEIGHT * car.width_m;
   if (pen.camera.perspective) {

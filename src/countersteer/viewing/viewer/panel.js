@@ -26,10 +26,9 @@ export function numbersIn(list, drives) {
 }
 
 /** The friction circles of a drive's wheels; returns what shows another moment. */
-export function circlesIn(box, drive) {
+export function circlesIn(box, drive, limit = largestLimit(drive)) {
   box.replaceChildren();
   if (!hasWheels(drive)) return () => {};
-  const limit = largestLimit(drive), time = drive.time_s;
   const made = ["Front left", "Front right", "Rear left", "Rear right"].map((name) => circle(box, name));
   // The car's nose is up, so a force to the left points left.
   const place = (x, y) => [-y / limit * CIRCLE, -x / limit * CIRCLE];
@@ -37,7 +36,7 @@ export function circlesIn(box, drive) {
     for (const [name, value] of Object.entries(values)) part.setAttribute(name, value);
   };
   return (moment) => made.forEach((parts, k) => {
-    const wheel = moment.wheels[k], series = drive.wheels[k];
+    const wheel = moment.wheels[k], series = drive.wheels[k], time = drive.time_s;
     const [x, y] = place(wheel.forceX, wheel.forceY);
     const share = wheel.limit > 0 ? Math.hypot(wheel.forceX, wheel.forceY) / wheel.limit : 0;
     parts.share.textContent = `${Math.round(100 * share)} %`;

@@ -1,10 +1,11 @@
 // The view of the car on its course: a canvas, a camera, and layers that can be switched off.
 
-import { drawCar } from "./car.js";
+import { drawCar, drawGhost } from "./car.js";
 import { CameraRig, TopCamera } from "./camera.js";
-import { boundsOf, hasPath, largestLimit, momentAt } from "./drive.js";
+import { beginOf, boundsOf, hasPath, largestLimit, momentAt } from "./drive.js";
 import {
-  drawDrivenPath, drawGrid, drawScaleBar, drawSkids, drawSonar, drawWalls, drawWholePath,
+  drawDrivenPath, drawGoal, drawGrid, drawPatches, drawScaleBar, drawSkids, drawSonar, drawWalls,
+  drawWholePath,
 } from "./floor.js";
 import { largestOf } from "./numbers.js";
 import {
@@ -24,6 +25,9 @@ export class Stage {
     this.context = canvas.getContext("2d");
     this.size = { width: 0, height: 0, ratio: 1, head: 0, foot: 0 };
     this.mapOnLeft = false;
+    this.companions = [];  // other drives that are only outlined, from the same start of the clock
+    this.patches = [];  // of other friction on the floor
+    this.goal = null;  // its line
     this.measure();
   }
 
@@ -57,6 +61,8 @@ export class Stage {
     const camera = rig.camera(moment, this.bounds, drive.car, size, margin, chase);
     const pen = new Pen(c, camera);
     drawGrid(pen, theme, size, moment, drive.car);
+    drawPatches(pen, this.patches, theme);
+    if (this.goal) drawGoal(pen, this.goal, theme);
     this.drives.forEach((one, k) => {
       if (!hasPath(one)) return;
       drawWholePath(pen, one, alone ? theme.colour("soft") : theme.run(k));
@@ -67,6 +73,10 @@ export class Stage {
     if (layers.rollouts && drive.rollouts?.length) drawRollouts(pen, drive, moment, theme);
     if (layers.sonar) drawSonar(pen, drive, moment, theme);
     if (layers.ghosts && alone) drawGhosts(pen, drive, moment, theme);
+    this.companions.forEach((one, k) => {
+      drawWholePath(pen, one, theme.run(k + 1));
+      drawGhost(pen, one.car, momentAt(one, beginOf(one) + moment.t), theme.run(k + 1), 1);
+    });
     if (layers.estimate) drawEstimate(pen, drive, moment, theme);
     this.drives.forEach((one, k) => {
       if (k !== focus && hasPath(one)) drawCar(pen, one.car, moments[k], theme, theme.run(k));

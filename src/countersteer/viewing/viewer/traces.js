@@ -4,7 +4,7 @@ import { indexAt, valueAt } from "./drive.js";
 import { clamp, signed, tickLabel, ticksBetween } from "./numbers.js";
 
 const MOST_DIFFERENCES = 4000;  // samples of a difference
-const NARROW = 640;  // px
+const NARROW = 640, LOW = 36;  // px: of the canvas, and of a strip whose texts share a line
 const EVENT_COLOURS = { fault: "bad", lost: "warn", released: "soft" };
 
 export const QUANTITIES = [
@@ -29,11 +29,20 @@ function columnOf(drive, row) {
 
 export class Traces {
   constructor(canvas, drives, theme) {
-    Object.assign(this, { canvas, drives, theme, axis: "time_s", differences: false });
+    Object.assign(this, { canvas, drives, theme, axis: "time_s", differences: false, least: {} });
     this.context = canvas.getContext("2d");
     // All but the cursor changes only with the size, the window and the colours, so it is kept.
     this.still = document.createElement("canvas");
     this.measure();
+  }
+
+  /** Show other drives: of what goes on, the last seconds. `least`: ranges shown in any case. */
+  follow(drives, span) {
+    this.drives = drives;
+    this.measure();
+    this.span = span;
+    this.layOut();
+    this.drawStill();
   }
 
   /** Show the drives over `time_s` or `place_m`, or their differences from the first. */
@@ -57,7 +66,7 @@ export class Traces {
         lines: compared ? this.differencesIn(row) : this.linesOf(row) }));
     if (compared && drives.every((one) => one.x_m)) this.rows.push(this.apart());
     if (compared && axis === "place_m") this.rows.push(this.later());
-    this.rows.forEach(scaleRow);
+    for (const row of this.rows) scaleRow(row, this.least[row.column]);
     this.events = drives.flatMap((one, k) => (axis === "time_s" ? one.events ?? [] : [])
       .map((event) => ({ ...event, k })));
     this.turns = axis === "time_s" && alone ? drives[0].summary.turns ?? [] : [];
@@ -149,6 +158,7 @@ export class Traces {
     this.left = narrow ? 40 : 182;
     this.right = this.width - (narrow ? 12 : 22);
     const tall = (this.height - top - foot - gap * rows.length) / rows.length;
+    this.low = !narrow && tall < LOW;
     rows.forEach((row, k) => {
       row.top = top + k * (tall + gap) + heading;
       row.bottom = top + k * (tall + gap) + tall;
@@ -331,9 +341,9 @@ export class Traces {
     const { theme, narrow } = this;
     c.textAlign = "left"; c.textBaseline = "middle";
     c.fillStyle = theme.colour("ink");
-    c.font = theme.font(12.5, 600);
+    c.font = theme.font(this.low ? 11.5 : 12.5, 600);
     c.fillText(`${row.name}, ${row.unit}`, narrow ? this.left : 18,
-      narrow ? row.top - 9 : (row.top + row.bottom) / 2 - 8);
+      narrow ? row.top - 9 : (row.top + row.bottom) / 2 - (this.low ? 0 : 8));
   }
 
   /** What the kinds of lines are, where there are several; the colours of runs are on the page. */
@@ -379,14 +389,14 @@ export class Traces {
 
   /** The dots on a row's lines, and the values as texts. */
   drawValues(c, row, at, x) {
-    const { theme, narrow } = this;
+    const { theme, low } = this, narrow = this.narrow || low;
     const shown = row.lines.filter((line) => line.k !== undefined)
       .map((line) => ({ line, value: valueAt({ x: line.x, y: line.y }, "y", at, "x") }));
-    const middle = narrow ? row.top - 9 : (row.top + row.bottom) / 2 + 8;
+    const middle = this.narrow ? row.top - 9 : (row.top + row.bottom) / 2 + (low ? 0 : 8);
     c.font = theme.font(12.5);
     c.textBaseline = "middle";
     c.textAlign = narrow ? "right" : "left";
-    let textX = narrow ? this.right : 18;
+    let textX = low ? this.left - 40 : narrow ? this.right : 18;
     for (const { line, value } of narrow ? [...shown].reverse() : shown) {
       if (x !== null && Number.isFinite(value)) {
         c.fillStyle = this.paint(line);
@@ -394,7 +404,7 @@ export class Traces {
         c.lineWidth = 1.5;
         c.beginPath(); c.arc(x, toY(row, value), 4, 0, 2 * Math.PI); c.fill(); c.stroke();
       }
-      const unit = shown.length > 1 ? "" : ` ${row.unit}`.replace(" °", "°");
+      const unit = shown.length > 1 || low ? "" : ` ${row.unit}`.replace(" °", "°");
       const text = signed(value, row.digits) + unit;
       c.fillStyle = line.run !== undefined ? this.paint(line)
         : theme.colour(narrow ? "ink" : "soft");
@@ -404,9 +414,9 @@ export class Traces {
   }
 }
 
-/** The range of a row and its round numbers. */
-function scaleRow(row) {
-  let low = row.free ? Infinity : 0, high = row.free ? -Infinity : 0;
+/** The range of a row and its round numbers; `least` is what it shows in any case. */
+function scaleRow(row, least) {
+  let [low, high] = least ?? (row.free ? [Infinity, -Infinity] : [0, 0]);
   for (const { y } of row.lines) {
     for (const value of y) {
       if (value < low) low = value;
