@@ -69,6 +69,7 @@ def cross_validate(
         kind = kinds(logs, fold)
         fitted, held = logs.where(kind == 1), logs.where(kind == 2)
         thin = fitted.where(tune.thinned(fitted.start, tune.EVERY["fitted"]))
+        thin = thin.where(tune.spread(thin.run, tune.MOST))
         report(f"fold {fold + 1} of {FOLDS}")
         found = fit.fit(cars, thin.shots, "all", report)
         charge = np.full(len(logs.runs), fit.FULL)

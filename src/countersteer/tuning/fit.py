@@ -433,7 +433,7 @@ class Problem:
                     row = np.zeros(len(self.parameters))
                     row[[j, self.parameters.index(pair)]] = 1, -1
                     rows.append(row / width)
-        return np.array(rows).reshape(-1, len(self.parameters))
+        return np.array(rows).reshape(len(rows), len(self.parameters))
 
     def tabled(self, cars: dict[str, Car], charge: np.ndarray | None = None) -> np.ndarray:
         """The values of `TABLE` for each log, `charge` where it states none: (logs, `TABLE`)."""

@@ -22,6 +22,7 @@ from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import CHANGES, QUANTITIES
 
 EVERY = {"fitted": 0.5, "judged": 0.25}  # s between the starts of windows
+MOST = 40  # windows of a log in a fit: logs count alike, so more of one only take time
 
 
 class Logs(NamedTuple):
@@ -132,6 +133,7 @@ def tune(
         parts = [("fitted", logs.where(kind == 1)), ("held out", logs.where(kind == 2))]
     fitted = parts[0][1]
     thin = fitted.where(thinned(fitted.start, EVERY["fitted"]))
+    thin = thin.where(spread(thin.run, MOST))
     result = fit.fit(cars, thin.shots, what, report)
     # A charge that no log states is estimated from the fitted windows; for other logs, from theirs.
     charge = fit.estimated_charge(result.cars, thin.shots)
@@ -191,6 +193,13 @@ def thinned(start: np.ndarray, every: float) -> np.ndarray:
     regular = np.abs(start / EVERY["judged"] - np.rint(start / EVERY["judged"])) < 1e-3
     kept = np.abs(start / every - np.rint(start / every)) < 1e-3
     return kept | ~regular
+
+
+def spread(run: np.ndarray, most: int) -> np.ndarray:
+    """The indices of at most so many windows of each log, evenly among its windows (windows,)."""
+    of_log = [np.flatnonzero(run == number) for number in np.unique(run)]
+    even = [np.unique(np.linspace(0, len(k) - 1, min(most, len(k))).astype(int)) for k in of_log]
+    return np.sort(np.concatenate([k[i] for k, i in zip(of_log, even, strict=True)]))
 
 
 def transient(shots: Shots) -> np.ndarray:
