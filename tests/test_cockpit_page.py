@@ -245,6 +245,7 @@ def test_a_player_drifts_round_a_corner_and_keeps_a_run_that_is_marked_and_repla
         page.locator(f"[data-run='{name}']").get_by_text("Replay").click()
     assert name in replay.value.url
     until(replay.value, "document.querySelector('h1').textContent.startsWith('box, person')")
+    until(replay.value, "document.getElementById('stage').width > 300")  # it is drawn
     replay.value.close()
     page.click("#clock [value='1']")
 
