@@ -38,6 +38,7 @@ export class CourseEditor {
     Object.assign(this, { panel, canvas, theme, send, redraw, drawn: structuredClone(EMPTY) });
     Object.assign(this, { past: [], future: [], sketch: null, pointer: null, line: null });
     Object.assign(this, { view: { x: 2, y: 0, scale: 90 }, active: false, trouble: "" });
+    this.look({ width: 0, height: 0 });
     this.build();
     this.showValues();
   }
@@ -309,11 +310,16 @@ export class CourseEditor {
 
   // ---- the picture ----
 
+  look(size) {
+    const { view } = this;
+    this.camera = new TopCamera(view.x, view.y, view.scale, size);
+  }
+
   draw(size, car) {
     const c = this.canvas.getContext("2d"), { theme, drawn, view } = this;
     c.setTransform(size.ratio, 0, 0, size.ratio, 0, 0);
     c.clearRect(0, 0, size.width, size.height);
-    this.camera = new TopCamera(view.x, view.y, view.scale, size);
+    this.look(size);
     const pen = new Pen(c, this.camera), dot = 5 / view.scale;
     drawGrid(pen, theme, size, { x: view.x, y: view.y }, car);
     const corridor = drawn.mode === "corridor";

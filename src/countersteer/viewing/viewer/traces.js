@@ -4,7 +4,7 @@ import { indexAt, valueAt } from "./drive.js";
 import { clamp, signed, tickLabel, ticksBetween } from "./numbers.js";
 
 const MOST_DIFFERENCES = 4000;  // samples of a difference
-const NARROW = 640, LOW = 36;  // px: of the canvas, and of a strip whose texts share a line
+const NARROW = 640, SHALLOW = 36;  // px: of the canvas, and of a strip whose texts share a line
 const EVENT_COLOURS = { fault: "bad", lost: "warn", released: "soft" };
 
 export const QUANTITIES = [
@@ -158,7 +158,7 @@ export class Traces {
     this.left = narrow ? 40 : 182;
     this.right = this.width - (narrow ? 12 : 22);
     const tall = (this.height - top - foot - gap * rows.length) / rows.length;
-    this.low = !narrow && tall < LOW;
+    this.low = !narrow && tall < SHALLOW;
     rows.forEach((row, k) => {
       row.top = top + k * (tall + gap) + heading;
       row.bottom = top + k * (tall + gap) + tall;
