@@ -20,7 +20,7 @@ from countersteer.tuning import fit, tune
 from countersteer.tuning.compare import compare
 from countersteer.tuning.log_sensors import resolve
 from countersteer.tuning.shooting import Shots
-from countersteer.world import plant
+from countersteer.world import plant, servo
 from studies import folds
 
 TRUE = {
@@ -232,14 +232,31 @@ def test_a_floor_that_no_log_tells_of_moves_with_the_others(windows):
     assert prior_cost({(front, 0): 0.3}) == pytest.approx((0.3 / width) ** 2)
 
 
-def test_the_steering_is_told_by_slow_driving(windows):
-    slow = fit.slow(windows.shots)
-    seen = windows.shots.measured
-    aside = np.abs(seen[:, 0] * seen[:, 2]).max(axis=1)
-    assert np.all(aside[slow] < fit.SLOW)
-    chosen = fit.steers(windows.shots)
-    few = (slow & fit.steered(windows.shots)).sum() < fit.ENOUGH
-    assert np.array_equal(chosen, fit.steered(windows.shots) if few else slow)
+def test_slow_driving_tells_the_steering_whatever_the_tyres_are(windows):
+    car = load_car("jetracer-tape")
+    true = {"servo.gain_left": 0.8, "servo.gain_right": 1.2, "servo.trim": math.radians(1.5)}
+    other = car
+    for path, value in true.items():
+        other = changed(other, path, np.float64(value))
+    commands = np.radians(np.repeat([-20.0, -8.0, 0.0, 8.0, 20.0], 6))
+    shots = fit.select(windows.shots, np.zeros(len(commands), int))
+    lines = shots.commands._replace(
+        steering=np.tile(commands[:, None], shots.commands.steering.shape[1])
+    )
+    speed = np.linspace(0.5, 0.9, len(commands))[:, None]
+    angle = np.asarray(servo.target(other.servo, commands))[:, None]
+    measured = np.full(shots.measured.shape, np.nan)
+    measured[:, 0], measured[:, 2] = speed, speed * np.tan(angle) / car.body.wheelbase
+    shots = shots._replace(commands=lines, measured=measured)
+    found = {one.path: one for one in fit.told(shots, car)}
+    assert set(found) == set(true)
+    for path, value in true.items():
+        assert abs(found[path].value - value) < found[path].deviation, path
+        assert found[path].value == pytest.approx(value, abs=0.03), path
+    # A side that is hardly driven to is not told of, nor is anything at speed.
+    left = fit.told(fit.select(shots, commands > -0.1), car)
+    assert [one.path for one in left] == ["servo.gain_left", "servo.trim"]
+    assert fit.told(shots._replace(measured=3 * measured), car) == []
 
 
 def test_held_out_windows_share_no_instant_with_fitted_ones():

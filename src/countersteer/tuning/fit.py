@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import least_squares
 
 from countersteer.car.car import Car
 from countersteer.car.parameter import Declaration, changed, declarations
@@ -42,10 +43,12 @@ from countersteer.signals import Array, SpeedCommand
 from countersteer.tuning import shooting
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import QUANTITIES, measured_for, why_no_window
+from countersteer.world import servo
 
 STEP = 0.002  # s, of the simulation; its error is then 1 % of the measurement's
 HORIZON = 1.0  # s, length of a window
 SCALES = np.array([0.05, 0.03, 0.12, 0.08])  # of `QUANTITIES`, SI units: errors of a good fit
+GAIN = 0.3  # prior standard deviation of the steering's gains in `told`
 LOOSE = 0.5  # prior standard deviation of a logarithm that is not in `WIDTHS`
 LANES = 64  # windows in every call of the compiled program; shorter blocks are padded
 GROUP = 8  # derivatives that one lane computes
@@ -58,7 +61,10 @@ DAMPING, EASY, STUCK = 0.01, 1e-6, 1e4  # of a step: first, least, and where a s
 KNOWN = 0.9  # ratio of posterior to prior deviation; below it, a parameter is determined
 STRAIGHT = math.radians(4)  # steering; below it, a window is straight
 SLOW = 1.5  # m/s² of lateral acceleration; below it, a tyre hardly slips
-ENOUGH = 10  # slow windows; fewer do not tell the steering
+CREEPS = 0.3  # m/s; below it, an angle of yaw rate over speed is noise
+STEADY = math.radians(1)  # largest change of a command that counts as steady
+ENOUGH = 5  # slow windows to a side; fewer do not tell the steering
+ANGLE = math.radians(0.3)  # error of what the slow driving of one log tells
 SLIDES = math.radians(10)  # sideslip; beyond it, a window slides
 SPINS = 0.5  # m/s of wheel speed above ground speed; beyond it, a window slides too
 HELD_OUT = 2.0  # s, length of a block; whole blocks are fitted or held out
@@ -100,7 +106,6 @@ STEERING = (
     "servo.lag",
     "servo.delay",
 )
-STEERING_MAP = ("servo.gain_left", "servo.gain_right", "servo.trim")  # what slow driving tells
 HANDLING = (
     "body.yaw_inertia",
     "body.front_roll_share",
@@ -187,19 +192,17 @@ def steered(shots: Shots) -> np.ndarray:
 
 
 def slow(shots: Shots) -> np.ndarray:
-    """True for windows without slides, of lateral accelerations below `SLOW`: (windows,)."""
-    speed = np.where(np.isfinite(shots.measured[:, 0]), shots.measured[:, 0], shots.measured[:, 3])
-    aside = np.abs(speed * shots.measured[:, 2])
-    return ~slides(shots) & ~(np.nan_to_num(aside, nan=math.inf) > SLOW).any(axis=1)
+    """True for windows of steady steering and little lateral acceleration: (windows,)."""
+    speed, yaw_rate = motion_of(shots)
+    aside = np.nan_to_num(np.abs(speed * yaw_rate), nan=math.inf)
+    steady = np.ptp(shots.commands.steering, axis=1) < STEADY
+    return steady & (aside < SLOW).all(axis=1) & (speed > CREEPS).all(axis=1)
 
 
-def steers(shots: Shots) -> np.ndarray:
-    """True for windows that tell the steering: (windows,).
-
-    They are the `slow` ones, straight ones too, if enough of them are `steered`.
-    """
-    chosen = slow(shots)
-    return chosen if (chosen & steered(shots)).sum() >= ENOUGH else steered(shots)
+def motion_of(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Forward speed, or else the wheels', and yaw rate: (windows, samples)."""
+    forward, wheels = shots.measured[:, 0], shots.measured[:, 3]
+    return np.where(np.isfinite(forward), forward, wheels), shots.measured[:, 2]
 
 
 def any_window(shots: Shots) -> np.ndarray:
@@ -209,8 +212,8 @@ def any_window(shots: Shots) -> np.ndarray:
 
 STAGES = {
     "longitudinal": Stage(SPEEDS, straight),
-    "steering": Stage((*STEERING_MAP, *STEERING[5:]), steers),
-    "handling": Stage((*STEERING[2:4], *HANDLING, *TIRES[:4]), steered),
+    "steering": Stage(STEERING, steered),
+    "handling": Stage((*HANDLING, *TIRES[:4]), steered),
     "drift": Stage((*HANDLING, *TIRES), slides),
     "all": Stage(PARAMETERS, any_window),
 }
@@ -619,8 +622,8 @@ def fit(
 
     `cars` are by surface, in the order of the shots' `surface`. They are the prior.
 
-    The steering's steady map is taken from slow windows, if there are enough. `all` then leaves it.
-    At speed a wrong map and wrong tyres can make up for each other, in these logs and no others.
+    Gains and trim of the steering are taken from slow driving, where there is enough (`told`). At
+    speed a wrong steering and wrong tyres make up for each other, on these logs and no others.
 
     Each stage also fits the charge of logs that do not state it. The exception is a single log in
     a stage with parameters of `SPEEDS`: one log cannot separate charge and motor.
@@ -628,13 +631,15 @@ def fit(
     Raises `InputError` if no window suits the stage `what`.
     """
     single_log = len(np.unique(shots.run)) == 1
-    total = 0
-    map_told: list[Fitted] = []
+    total, map_told = 0, told(shots, next(iter(cars.values())))
+    known = {one.path for one in map_told}
+    for one in map_told:
+        cars = {k: changed(car, one.path, np.float64(one.value)) for k, car in cars.items()}
+        report(f"{one.path}: {one.value:.4g} from slow driving")
     current, charge = cars, np.full(int(shots.run.max()) + 1, FULL)
     for name in ORDER if what == "all" else (what,):
         stage = STAGES[name]
-        told = {one.path for one in map_told}
-        free = tuple(path for path in stage.parameters if path not in told)
+        free = tuple(path for path in stage.parameters if path not in known)
         if isinstance(shots.commands, SpeedCommand) and set(free) & set(SPEEDS):
             free = (*free, *CONTROLLER)
         if not (single_log and set(free) & set(SPEEDS)):
@@ -656,23 +661,48 @@ def fit(
         charges = problem.charge_at(solved.x)
         charge[: len(charges)] = charges
         report(f"{name}: {int(chosen.sum())} windows, cost {solved.cost:.4g}")
-        if name == "steering" and (slow(shots) & steered(shots)).sum() >= ENOUGH:
-            found = believed(cars, current, part, STEERING_MAP, charge=charge)
-            total += found.evaluations
-            map_told = [one for one in found.fitted if one.path in STEERING_MAP]
-            cars, current = (
-                {key: with_steering(car, found.cars[key]) for key, car in some.items()}
-                for some in (cars, current)
-            )
     result = believed(cars, current, part, free, report, charge, total)
     return result._replace(fitted=map_told + result.fitted)
 
 
-def with_steering(car: Car, other: Car) -> Car:
-    """The car with the steady steering of another."""
-    for path in STEERING[:5]:
-        car = changed(car, path, np.float64(value_of(other, path)))
-    return car
+def told(shots: Shots, car: Car) -> list[Fitted]:
+    """What slow driving tells of the steering: gains and trim; none if it tells too little.
+
+        atan(wheelbase · yaw rate / speed) = servo.target(command)
+
+    It needs no tyres, since they hardly slip. Logs count alike. The limits are the car's. A side
+    with less than `ENOUGH` windows is not told of.
+    """
+    chosen = slow(shots)
+    command = np.median(shots.commands.steering, axis=1)
+    sides = [chosen & (command > STRAIGHT), chosen & (command < -STRAIGHT)]
+    paths = [path for path, side in zip(STEERING[:2], sides, strict=True) if side.sum() >= ENOUGH]
+    if not paths:
+        return []
+    paths.append("servo.trim")
+    part = select(shots, chosen)
+    command, run = command[chosen], shots.run[chosen]
+    speed, yaw_rate = motion_of(part)
+    angle = np.arctan(float(car.body.wheelbase) * np.median(yaw_rate / speed, axis=1))
+    weight = 1 / np.sqrt(np.bincount(run)[run])
+    prior = np.array([value_of(car, path) for path in paths])
+    width = np.array([GAIN] * (len(paths) - 1) + [ABSOLUTE["servo.trim"]])
+
+    def residuals(values: np.ndarray) -> np.ndarray:
+        tried = car
+        for path, value in zip(paths, values, strict=True):
+            tried = changed(tried, path, np.float64(value))
+        off = np.asarray(servo.target(tried.servo, command)) - angle
+        return np.concatenate([weight * off / ANGLE, (values - prior) / width])
+
+    with jax.enable_x64(True):
+        found = least_squares(residuals, prior, loss="soft_l1", x_scale=width)
+    jacobian = np.asarray(found.jac)
+    deviation = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))).tolist()
+    return [
+        Fitted(path, None, None, float(before), float(value), error, error, 0.0, True, False)
+        for path, before, value, error in zip(paths, prior, found.x, deviation, strict=True)
+    ]
 
 
 def estimated_charge(cars: dict[str, Car], shots: Shots) -> np.ndarray:
