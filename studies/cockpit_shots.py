@@ -123,7 +123,7 @@ def pictures(browser: Browser, address: str, folder: Path) -> None:
     draw_course(page)
     kept(page, folder / "cockpit-course.png")
     page.context.close()
-    phone = {"viewport": PHONE, "has_touch": True, "is_mobile": True}
+    phone: dict[str, Any] = {"viewport": PHONE, "has_touch": True, "is_mobile": True}
     page = opened(browser, address, **phone)
     driven(page, 2.6)
     kept(page, folder / "cockpit-phone.png")

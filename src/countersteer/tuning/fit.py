@@ -1,8 +1,8 @@
 """Fit a car's parameters to windows of logs by robust least squares, with their uncertainty.
 
     minimise  sum over windows, quantities, samples of rho(w (predicted - measured) / scale)
-              + sum over parameters of rho((u - u_prior) / width)
-              + sum over what floors share of rho((d_floor - mean of floors) / width)
+              + sum over parameters of ((u - u_prior) / width)² / 2
+              + sum over what floors share of ((d_floor - mean of floors) / width)² / 2
 
 u is the logarithm of a parameter. The parameters of `ABSOLUTE` may be zero or negative, so u is
 their value itself. rho is the soft L1 loss (`loss`). It limits the cost of outliers, such as a
@@ -527,11 +527,11 @@ class Problem:
         fun, damping, evaluations = self.residuals(u), DAMPING, 1
         for _ in range(passes):
             jacobian, evaluations = self.jacobian(u) * self.width, evaluations + 1
-            slope, bend = loss(fun)[1:]
+            _, slope, bend = self.loss(fun)
             gradient = jacobian.T @ (slope * fun)
             hessian = jacobian.T @ (bend[:, None] * jacobian)
             free = ~(((u <= self.low) & (gradient > 0)) | ((u >= self.high) & (gradient < 0)))
-            before = float(loss(fun)[0].sum())
+            before = float(self.loss(fun)[0].sum())
             while damping < STUCK:
                 block = hessian[np.ix_(free, free)]
                 step = np.zeros(len(u))
@@ -540,15 +540,27 @@ class Problem:
                 )
                 candidate = np.clip(u + step * self.width, self.low, self.high)
                 candidate_fun, evaluations = self.residuals(candidate), evaluations + 1
-                if loss(candidate_fun)[0].sum() < before:
+                if self.loss(candidate_fun)[0].sum() < before:
                     break
                 damping *= 4
             else:
                 break
             u, fun, damping = candidate, candidate_fun, max(damping / 3, EASY)
-            if before - loss(fun)[0].sum() < TOLERANCE * before:
+            if before - self.loss(fun)[0].sum() < TOLERANCE * before:
                 break
-        return Solved(u, float(loss(fun)[0].sum()), fun, evaluations)
+        return Solved(u, float(self.loss(fun)[0].sum()), fun, evaluations)
+
+    def loss(self, fun: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`loss` of the samples, and half the squares of the prior. Windows err; a prior does not.
+
+        A robust prior would let a number that the logs hardly tell run off for next to nothing.
+        """
+        found = loss(fun)
+        prior = fun[self.known.size :]
+        squares = prior**2 / 2, np.ones(len(prior)), np.ones(len(prior))
+        for part, plain in zip(found, squares, strict=True):
+            part[self.known.size :] = plain
+        return found
 
     def cars_at(self, u: Array) -> dict[str, Car]:
         """The cars by surface with the fitted values at u. Each keeps its other values."""
@@ -802,7 +814,7 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
     """
     count = len(problem.parameters)
     observations = max(1, int(problem.known[:, :, -1].sum()))
-    weighted = np.sqrt(loss(solved.fun)[2])[:, None] * problem.jacobian(solved.x)
+    weighted = np.sqrt(problem.loss(solved.fun)[2])[:, None] * problem.jacobian(solved.x)
     samples = problem.known.size
     data, prior = weighted[:samples], weighted[samples:]
     noise = max(1.0, float(np.sum(np.minimum(solved.fun[:samples] ** 2, GROSS)) / observations))

@@ -77,12 +77,9 @@ class Log(NamedTuple):
 CARS = {
     "circles_tape_and_tiles": "jetracer-tape",
     "drift_tape_and_tiles": "jetracer-tape",
-    "slippery_floor_racing": "jetracer-slippery",
-    "slippery_floor_racing_no_tape": "jetracer-slippery",
+    "slippery_floor_racing": "jetracer-tape",
+    "slippery_floor_racing_no_tape": "jetracer-tape",
     "throttle_ramps": "jetracer-tiles",
-    "circles_27_sept_2024_fast_ramp": "jetracer-tiles",
-    "steering_steps": "jetracer-january",
-    "steering_sines": "jetracer-january",
 }
 
 
