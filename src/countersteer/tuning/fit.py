@@ -808,7 +808,7 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
     observation of each quantity, since w contains 1/sqrt(samples). noise is the sum of
     the squared residuals, each at most `GROSS`, over the observations. It is at least 1.
 
-    The parameter with the largest ratio of deviation to prior width is fixed. This repeats until
+    The parameter whose deviation is largest beside its prior one is fixed. This repeats until
     all remaining ratios are below `KNOWN`. If the data give only the sum of two parameters, one
     of them is fixed and the other is determined.
     """
@@ -822,10 +822,14 @@ def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray
     left = list(range(count))
     deviation = problem.width.copy()
     while left:
-        posterior = np.sqrt(np.diag(np.linalg.pinv(information[np.ix_(left, left)])))
+        block = np.ix_(left, left)
+        posterior, before = (
+            np.sqrt(np.diag(np.linalg.pinv(matrix[block])))
+            for matrix in (information, prior.T @ prior)
+        )
         deviation[left] = posterior
-        worst = int(np.argmax(posterior / problem.width[left]))
-        if posterior[worst] < KNOWN * problem.width[left[worst]]:
+        worst = int(np.argmax(posterior / before))
+        if posterior[worst] < KNOWN * before[worst]:
             break
         del left[worst]
     determined = np.isin(np.arange(count), left)

@@ -80,6 +80,7 @@ CARS = {
     "slippery_floor_racing": "jetracer-tape",
     "slippery_floor_racing_no_tape": "jetracer-tape",
     "throttle_ramps": "jetracer-tiles",
+    "circles_27_sept_2024_fast_ramp": "jetracer-tiles",  # by its grip: docs/tuning.md
 }
 
 
