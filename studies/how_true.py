@@ -134,9 +134,10 @@ REASONS = {
     "August reaches 0.6 m/s at 0.23. So the speed controller was set in another way, and no "
     "battery makes up for it. The yaw rate is off because the speed is.",
     "steering_sines": "They are of January 2024 too.",
-    "circles_27_sept_2024_fast_ramp": "At 0.8 to 1.3 m/s, within grip, the car turns by 1.72 to "
-    "1.77 rad per metre at one command of 20.9° to the left. So its wheels are at 17°, and turn "
-    "less than those of a car that was fitted to faster drives.",
+    "throttle_ramps": "A steady circle, which doing nothing predicts.",
+    "circles_tape_and_tiles": "A steady circle, which doing nothing predicts.",
+    "slippery_floor_racing": "The car of 2025 drives more weakly at the same throttle than that of "
+    "September 2024, more than a battery explains.",
     "tudelft_1to5": "The car is the one of the examples, before any fit.",
     "f1tenth_ds5": "The car is the one of the examples, before any fit.",
 }
