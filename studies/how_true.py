@@ -121,7 +121,7 @@ STEPS = "throttle_steps_rubber_floor"  # also judged over the whole of each run
 # Part of a log's name, the manoeuvre, and whether the whole of it is one window
 PICTURES = {
     "drift": ("drifting_clockwise", "Drift at full throttle and full lock", False),
-    "circle": ("09_27_2024", "Circles on rubber, another day", False),
+    "circle": ("09_27_2024", "Circles on tiles, another day", False),
     "ramp": ("15_46_50steer02_ramp", "Throttle ramps on tiles", False),
     "steps": ("08_30_2024_15_01_02", "A straight step of throttle, the whole run", True),
     "slide": ("train_2", "Slides of the ETH car", False),
