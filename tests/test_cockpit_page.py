@@ -437,7 +437,7 @@ def test_silence_of_the_page_cuts_the_throttle_within_200_ms_and_so_does_its_end
     until(page, f"{TIME} > {stalled} + 0.7 && {THROTTLE} > 0")
     page.close()  # in mid-drive
     closed = watcher.evaluate(TIME)
-    until(watcher, f"{TIME} > {closed} + 0.2")
+    until(watcher, f"{TIME} > {closed} + 0.3")  # 200 ms, and what a picture may be old
     assert watcher.evaluate(THROTTLE) == 0
     until(watcher, role_is("drives"))
     watcher.keyboard.press("r")

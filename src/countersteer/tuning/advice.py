@@ -24,6 +24,9 @@ LOGS = {  # a log: the parameters that it determines
         "tires.*.longitudinal_ratio",
         "body.front_roll_share",
     ),
+    "steady circles at several speeds, and straights at the same throttles": (
+        "tires.*.cornering_drag",
+    ),
     "any of these again, with battery_charge in its run.toml": ("battery.charge",),
     "quick changes of steering from side to side below the limit of grip, yaw rate at 50 Hz or "
     "more": ("body.yaw_inertia",),
