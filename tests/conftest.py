@@ -1,8 +1,10 @@
-"""What the tests share: 64-bit floats, JAX's cache on disk, and programs that compile once."""
+"""What tests share: 64-bit floats, JAX's cache on disk, programs that compile once, a browser."""
 
+import contextlib
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,8 @@ ROWS = 8  # walls of each car
 # The numbers of drift-turn where a drive is only what filters, faults or the judge are tried on.
 STEADY = load_policy(str(Path(__file__).with_name("steady.toml")))
 SLOTS = 512  # of the delay lines: 20 ms at the finest step
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 
 
 configure_jax()  # before anything computes: it sets how to compile
@@ -219,3 +223,43 @@ def judged(course: Course | None, record: Record, dt: float = 0.001) -> tuple[Sc
     own = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], own)
     score, _ = task.follow(task.init(), Sample(dt * record.tick[rows], *own))
     return score, turns.results(score.turns, score.handover, float(score.time))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="no Playwright here: pip install 'countersteer[browser]'"
+    )
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here to open pages in")
+    with playwright.sync_playwright() as driver:
+        flags = ["--no-sandbox", "--disable-gpu"]
+        launched = driver.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield launched
+        launched.close()
+
+
+@contextlib.contextmanager
+def windows(browser: Any, *known: str) -> Iterator[Callable[..., Any]]:
+    """Opens windows, each in a context of its own.
+
+    In the end it fails if a page had an error, or asked for what begins with none of `known`.
+    """
+    contexts, troubles, asked = [], [], []
+
+    def window(phone: bool = False) -> Any:
+        context = browser.new_context(
+            viewport=PHONE if phone else DESKTOP, has_touch=phone, is_mobile=phone
+        )
+        contexts.append(context)
+        context.on("request", lambda one: asked.append(one.url))
+        page = context.new_page()
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("dialog", lambda dialog: troubles.append(f"dialog {dialog.message}"))
+        return page
+
+    yield window
+    for context in contexts:
+        context.close()
+    assert not troubles
+    assert all(url.startswith(known) for url in asked)

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conftest import DESKTOP, PHONE, windows
 from countersteer import cli
 from countersteer.errors import InputError
 from countersteer.recorded_drive import Watched
@@ -26,11 +26,9 @@ from countersteer.viewing.side_by_side import differences, with_places
 from countersteer.viewing.style import PALETTE
 from countersteer.viewing.view import COLUMNS, POSE, events, is_simulated, view_of
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DATA = Path(__file__).parents[2] / "shared" / "data"
 DART = "dart/drift_tape_and_tiles/car_1_Datarecording_09_09_2024_18_13_59drifting_clockwise.csv"
 HOSTILE = "</script><script>alert(1)</script><b>{{view}}"
-DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 
 
 def made_view(name: str = "made", speed: float = 1.0) -> dict[str, Any]:
@@ -218,6 +216,17 @@ def test_a_real_run_has_speed_and_sideslip_whether_it_tells_velocities_or_poses(
         draw_picture(view, tmp_path / "report.png")
 
 
+def test_a_switch_that_is_rarely_told_is_one_event_and_an_empty_truth_is_none():
+    time, nothing = np.arange(8.0), math.nan
+    armed = np.array([1, nothing, 0, nothing, nothing, 0, 1, nothing])
+    commands = Table(time_s=time, throttle=0 * time, steering=0 * time)
+    empty = Table({name: np.zeros(0) for name in ("time_s", *POSE, *COLUMNS)})
+    run = Run(Path("log"), {}, commands, Table(time_s=time, armed=armed), empty)
+    (event,) = events(run)
+    assert (event["kind"], event["from_s"], event["to_s"]) == ("released", 2.0, 6.0)
+    assert not is_simulated(run)
+
+
 def test_lost_commands_of_a_radio_are_the_gaps_between_those_that_came(tmp_path):
     run = write_log(tmp_path / "run", True)
     times = [0.02, 0.12, 0.32, 0.42]
@@ -318,46 +327,19 @@ def test_report_puts_several_runs_on_one_page_and_import_makes_one_at_once(tmp_p
 Opened = Callable[..., Any]
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="no Playwright here: pip install 'countersteer[browser]'"
-    )
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here to open pages in")
-    with playwright.sync_playwright() as driver:
-        flags = ["--no-sandbox", "--disable-gpu"]
-        launched = driver.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield launched
-        launched.close()
-
-
 @pytest.fixture
 def opened(browser: Any, tmp_path: Path) -> Iterator[Opened]:
-    """Opens a page's text, and fails the test if the page has an error or asks anything."""
-    contexts, troubles, asked = [], [], []
+    """Opens a page's text, which asks nobody for anything."""
+    with windows(browser, "file:", "blob:") as window:
 
-    def open_page(text: str, address: str = "", phone: bool = False) -> Any:
-        file = tmp_path / "page.html"
-        file.write_text(text, encoding="utf-8")
-        context = browser.new_context(
-            viewport=PHONE if phone else DESKTOP,
-            has_touch=phone,
-            is_mobile=phone,
-        )
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: troubles.append(str(error)))
-        page.on("dialog", lambda dialog: troubles.append(f"dialog {dialog.message}"))
-        page.on("request", lambda one: asked.append(one.url))
-        page.goto(file.as_uri() + address)
-        return page
+        def open_page(text: str, address: str = "", phone: bool = False) -> Any:
+            file = tmp_path / "page.html"
+            file.write_text(text, encoding="utf-8")
+            page = window(phone)
+            page.goto(file.as_uri() + address)
+            return page
 
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert not troubles
-    assert all(url.startswith(("file:", "blob:")) for url in asked)
+        yield open_page
 
 
 DRAWN = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
@@ -504,17 +486,6 @@ def test_the_traces_zoom_with_ctrl_and_scrub_by_a_drag(opened, pages):
     page.keyboard.up("Control")
     zoomed = box_of(page, "turn", "traces")
     assert zoomed[2] - zoomed[0] > 1.2 * (turn[2] - turn[0])
-
-
-def test_a_switch_that_is_rarely_told_is_one_event_and_an_empty_truth_is_none():
-    time, nothing = np.arange(8.0), math.nan
-    armed = np.array([1, nothing, 0, nothing, nothing, 0, 1, nothing])
-    commands = Table(time_s=time, throttle=0 * time, steering=0 * time)
-    empty = Table({name: np.zeros(0) for name in ("time_s", *POSE, *COLUMNS)})
-    run = Run(Path("log"), {}, commands, Table(time_s=time, armed=armed), empty)
-    (event,) = events(run)
-    assert (event["kind"], event["from_s"], event["to_s"]) == ("released", 2.0, 6.0)
-    assert not is_simulated(run)
 
 
 def test_it_plays_steps_and_looks_from_behind(opened, pages):
