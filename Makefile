@@ -39,11 +39,12 @@ estimation: $(READY)
 corners: $(READY)
 	$(BIN)/python -m studies.corners
 
-# Random cars, damaged files and killed commands: half an hour on two cores.
+# Random cars, damaged files, killed commands, nonsense to the cockpit: half an hour on two cores.
 hostile: $(READY)
 	$(BIN)/python -m studies.fuzz_physics
 	$(BIN)/python -m studies.fuzz_files
 	$(BIN)/python -m studies.kills
+	$(BIN)/python -m studies.cockpit_hostile
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks.speed docs/speed.md

@@ -68,8 +68,7 @@ def cross_validate(
     for fold in range(FOLDS):
         kind = kinds(logs, fold)
         fitted, held = logs.where(kind == 1), logs.where(kind == 2)
-        thin = fitted.where(tune.thinned(fitted.start, tune.EVERY["fitted"]))
-        thin = thin.where(tune.spread(thin.run, tune.MOST))
+        thin = fitted.where(tune.spread(fitted.run))
         report(f"fold {fold + 1} of {FOLDS}")
         found = fit.fit(cars, thin.shots, "all", report)
         charge = np.full(len(logs.runs), fit.FULL)
@@ -133,7 +132,7 @@ def read(base: str, paths: Sequence[Path]) -> tuple[tune.Logs, dict[str, Car]]:
     name = Path(base).stem
     named = {str(run.about.get("car_name", name)) for run in runs} - {name}
     cars = tune.by_surface(name, load_car(base), tune.other_floors(base, named))
-    return tune.read_logs(runs, cars, tune.EVERY["judged"], name), cars
+    return tune.read_logs(runs, cars, tune.EVERY, name), cars
 
 
 def main(arguments: Sequence[str]) -> Any:

@@ -130,14 +130,10 @@ PICTURES = {
 
 # What is known of logs that a car of the library predicts badly
 REASONS = {
-    "steering_steps": "The car of January 2024 goes 1.1 m/s at a throttle of 0.16 to 0.19. That of "
-    "August reaches 0.6 m/s at 0.23. So the speed controller was set in another way, and no "
-    "battery makes up for it. The yaw rate is off because the speed is.",
-    "steering_sines": "They are of January 2024 too.",
+    "throttle_steps_rubber_floor": "One trim of the steering stands for all days. On a straight at "
+    "2 m/s, half a degree of it is 0.1 rad/s.",
     "throttle_ramps": "A steady circle, which doing nothing predicts.",
     "circles_tape_and_tiles": "A steady circle, which doing nothing predicts.",
-    "slippery_floor_racing": "The car of 2025 drives more weakly at the same throttle than that of "
-    "September 2024, more than a battery explains.",
     "tudelft_1to5": "The car is the one of the examples, before any fit.",
     "f1tenth_ds5": "The car is the one of the examples, before any fit.",
 }

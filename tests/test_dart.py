@@ -14,6 +14,7 @@ from countersteer.runs.run import Run, read_run
 from countersteer.signals import TRUTH
 from countersteer.tuning import windows
 from countersteer.tuning.compare import Compared, compare, sensed, slides
+from countersteer.tuning.log_sensors import resolve
 from countersteer.tuning.windows import (
     Measured,
     Reference,
@@ -389,5 +390,7 @@ def test_a_straight_step_is_compared_by_its_sensors(imported, car):
     result, series = compare(run, car, 1.0, 0.001)
     assert list(result["rmse"]) == ["yaw_rate_radps", "wheel_speed_mps"]
     assert result["rmse"]["wheel_speed_mps"] < 1.0
-    steps = series["windows"][0]["wheel_speed_mps"].simulated / encoder_timing(run, car).step
+    step = encoder_timing(resolve(run, car, 0.001).run, car).step
+    assert step == pytest.approx(0.0413, rel=2e-3)  # read off the log
+    steps = series["windows"][0]["wheel_speed_mps"].simulated / step
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)

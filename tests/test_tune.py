@@ -80,8 +80,10 @@ def test_the_true_car_predicts_its_logs(logs, windows):
     true = cars["jetracer-tape"]
     for name, value in TRUE.items():
         true = changed(true, name, np.float64(value))
-    found = fit.errors({"jetracer-tape": true}, windows.shots)
-    guessed = fit.errors(cars, windows.shots)
+    found, guessed = (
+        fit.errors(fit.Problem(some, windows.shots, ()).predictions(), windows.shots)
+        for some in ({"jetracer-tape": true}, cars)
+    )
     for quantity, limit in (("vx_mps", 0.01), ("vy_mps", 0.01), ("yaw_rate_radps", 0.05)):
         error = found["simulated"][quantity]["median_abs_error"]
         assert error < limit, quantity
@@ -357,7 +359,7 @@ def test_errors_are_pooled_by_log(logs, windows):
     _, cars = logs
     found = folds.judged(cars, windows)
     assert sorted(found) == [0, 1, 2]
-    whole = fit.errors(cars, windows.shots)
+    whole = fit.errors(fit.Problem(cars, windows.shots, ()).predictions(), windows.shots)
     for kind, name in (("simulated", "simulated"), ("unchanged", "persistence")):
         off = np.concatenate([getattr(found[run], kind) for run in range(3)])
         medians = np.nanmedian(off, axis=0)
@@ -395,8 +397,10 @@ def test_the_taped_car_settles_into_the_drift_of_its_log(tmp_path):
     truth = read_run(out).truth
     late = truth["time_s"] > 8
     sideslip = np.degrees(np.arctan2(truth["vy_mps"][late], truth["vx_mps"][late]))
-    assert np.median(sideslip) == pytest.approx(58.7, abs=3.5)  # 55.6
-    assert np.median(truth["yaw_rate_radps"][late]) == pytest.approx(-4.0, abs=0.3)
+    # What the log has for its centre of mass: 56.4 ± 1.8° over 5.8 s. (58.7° is often quoted: that
+    # leaves out that the captured point is 1 cm to the right, which is 0.04 m/s at this yaw rate.)
+    assert np.median(sideslip) == pytest.approx(56.4, abs=1.8)
+    assert np.median(truth["yaw_rate_radps"][late]) == pytest.approx(-4.05, abs=0.3)
 
 
 def test_a_replay_starts_from_the_charge_that_is_given(logs, tmp_path, capsys):

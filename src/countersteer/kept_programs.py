@@ -287,7 +287,9 @@ def _strong(leaf: Any) -> Any:
     """The argument with a type of its own, so that all calls share what was compiled."""
     if isinstance(leaf, jax.Array) and not getattr(leaf, "weak_type", False):
         return leaf
-    return np.asarray(leaf, jax.dtypes.canonicalize_dtype(jnp.result_type(leaf)))
+    known = isinstance(leaf, np.ndarray | np.generic)  # to ask JAX for it takes 30 times as long
+    dtype = leaf.dtype if known else jnp.result_type(leaf)
+    return np.asarray(leaf, jax.dtypes.canonicalize_dtype(dtype))
 
 
 @functools.cache

@@ -91,13 +91,11 @@ def tune_all(
 
     with jax.enable_x64(True):
         cars = tune.by_surface(base, car, others)
-        logs = old = tune.read_logs(runs, cars, tune.EVERY["judged"], base)
+        logs = old = tune.read_logs(runs, cars, tune.EVERY, base)
         if new:
-            since = tune.read_logs(new, cars, tune.EVERY["judged"], base)
+            since = tune.read_logs(new, cars, tune.EVERY, base)
             logs = old.joined(since)
-        judged = (
-            tune.read_logs(validation, cars, tune.EVERY["judged"], base) if validation else None
-        )
+        judged = tune.read_logs(validation, cars, tune.EVERY, base) if validation else None
         hold_out = not validation if options.hold_out is None else bool(options.hold_out)
         say = (lambda _: None) if options.json else (lambda text: print(f"  {text}", flush=True))
         result, about, parts = tune.tune(logs, cars, options.fit, hold_out, judged, say)

@@ -247,7 +247,7 @@ def agreeing_charge(run: Run, car: Car, measured: Measured, dt: float) -> float:
             if (one := window.get(name)) is not None
         ]
         expected = (charge - fit.FULL) / fit.ABSOLUTE[fit.CHARGE]
-        return float(fit.loss(np.append(np.concatenate([*residuals, []]), expected))[0].sum())
+        return float(fit.loss(np.concatenate([*residuals, []]))[0].sum() + expected**2 / 2)
 
     found = minimize_scalar(
         cost, bounds=(fit.EMPTY, fit.FULL), method="bounded", options={"xatol": CHARGE_WITHIN}

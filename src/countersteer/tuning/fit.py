@@ -418,6 +418,7 @@ class Problem:
         margin = 1e-6 * self.width
         self.prior = np.clip(self.prior, self.low + margin, self.high - margin)
         self.expected = np.concatenate([np.diag(1 / self.width), self.shared()])
+        self.offset = np.zeros(len(self.expected))  # of these rows, by what is fixed
 
     def shared(self) -> np.ndarray:
         """The rows of what floors share: their product with u - u_prior is (rows,)."""
@@ -479,7 +480,7 @@ class Problem:
         """
         found = self.predictions(u)
         data = np.where(self.known, (found - self.shots.measured) / self.divisor, 0.0)
-        prior = self.expected @ (u - self.prior)
+        prior = self.expected @ (u - self.prior) + self.offset
         return np.concatenate([np.nan_to_num(data, nan=1e2).ravel(), prior])
 
     def jacobian(self, u: Array) -> np.ndarray:
@@ -643,9 +644,11 @@ def fit(
     Raises `InputError` if no window suits the stage `what`.
     """
     single_log = len(np.unique(shots.run)) == 1
-    total, map_told = 0, told(shots, next(iter(cars.values())))
-    known = {one.path for one in map_told}
-    for one in map_told:
+    total, of_slow = 0, []
+    if what in ("all", "steering"):
+        of_slow = told(shots, next(iter(cars.values())))
+    known = {one.path for one in of_slow}
+    for one in of_slow:
         cars = {k: changed(car, one.path, np.float64(one.value)) for k, car in cars.items()}
         report(f"{one.path}: {one.value:.4g} from slow driving")
     current, charge = cars, np.full(int(shots.run.max()) + 1, FULL)
@@ -674,7 +677,7 @@ def fit(
         charge[: len(charges)] = charges
         report(f"{name}: {int(chosen.sum())} windows, cost {solved.cost:.4g}")
     result = believed(cars, current, part, free, report, charge, total)
-    return result._replace(fitted=map_told + result.fitted)
+    return result._replace(fitted=of_slow + result.fitted)
 
 
 def told(shots: Shots, car: Car) -> list[Fitted]:
@@ -797,7 +800,9 @@ class Held(Problem):
             setattr(self, name, [one for one, stays in kept if stays])
         for name in ("index", "logarithmic", "start", "prior", "low", "high", "width"):
             setattr(self, name, getattr(whole, name)[free])
+        fixed = whole.start[~free] - whole.prior[~free]
         self.expected = whole.expected[:, free]
+        self.offset = whole.offset + whole.expected[:, ~free] @ fixed
 
 
 def deviations(problem: Problem, solved: Solved) -> tuple[np.ndarray, np.ndarray]:
@@ -869,17 +874,17 @@ def by_halves(whole: Problem, determined: np.ndarray, u: np.ndarray) -> np.ndarr
     return np.where(in_both, np.abs(ends[1] - ends[0]) / 2, 0.0)
 
 
-def errors(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
+def errors(predicted: np.ndarray, shots: Shots) -> dict[str, Any]:
     """Errors of each measured quantity: simulated, and by persistence (no change after the start).
 
-    Each quantity has two numbers: `median_abs_error` at the ends of windows, and `rmse` over all.
+    `predicted` is what `Problem.predictions` returns. Each quantity has two numbers:
+    `median_abs_error` at the ends of windows, and `rmse` over all.
     """
-    found = Problem(cars, shots, ()).predictions()
     start = np.stack(
         [shots.velocity.x, shots.velocity.y, shots.velocity.yaw, shots.wheel_speed], axis=1
     )[:, :, None]
     result: dict[str, Any] = {"windows": len(shots.surface)}
-    for name, prediction in (("simulated", found), ("persistence", start)):
+    for name, prediction in (("simulated", predicted), ("persistence", start)):
         error = prediction - shots.measured
         result[name] = {
             quantity: {

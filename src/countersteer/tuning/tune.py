@@ -21,8 +21,8 @@ from countersteer.tuning.log_sensors import LogSensors, resolve
 from countersteer.tuning.shooting import Shots
 from countersteer.tuning.windows import CHANGES, QUANTITIES
 
-EVERY = {"fitted": 0.5, "judged": 0.25}  # s between the starts of windows
-MOST = 40  # windows of a log in a fit: logs count alike, so more of one only take time
+EVERY = 0.25  # s between the starts of windows
+MOST = 640  # windows in a fit, an equal share for each log: more only take time
 
 
 class Logs(NamedTuple):
@@ -132,8 +132,7 @@ def tune(
             raise InputError("too little data to hold a part out: give --validate, or --hold-out 0")
         parts = [("fitted", logs.where(kind == 1)), ("held out", logs.where(kind == 2))]
     fitted = parts[0][1]
-    thin = fitted.where(thinned(fitted.start, EVERY["fitted"]))
-    thin = thin.where(spread(thin.run, MOST))
+    thin = fitted.where(spread(fitted.run))
     result = fit.fit(cars, thin.shots, what, report)
     # A charge that no log states is estimated from the fitted windows; for other logs, from theirs.
     charge = fit.estimated_charge(result.cars, thin.shots)
@@ -188,17 +187,11 @@ def tune(
     return result, about, parts
 
 
-def thinned(start: np.ndarray, every: float) -> np.ndarray:
-    """True for windows that start at multiples of `every` (s), or off the regular grid (onsets)."""
-    regular = np.abs(start / EVERY["judged"] - np.rint(start / EVERY["judged"])) < 1e-3
-    kept = np.abs(start / every - np.rint(start / every)) < 1e-3
-    return kept | ~regular
-
-
-def spread(run: np.ndarray, most: int) -> np.ndarray:
-    """The indices of at most so many windows of each log, evenly among its windows (windows,)."""
+def spread(run: np.ndarray) -> np.ndarray:
+    """The indices of `MOST` windows or less, evenly among those of each log (windows,)."""
     of_log = [np.flatnonzero(run == number) for number in np.unique(run)]
-    even = [np.unique(np.linspace(0, len(k) - 1, min(most, len(k))).astype(int)) for k in of_log]
+    share = max(MOST // len(of_log), 1)
+    even = [np.unique(np.linspace(0, len(k) - 1, min(share, len(k))).astype(int)) for k in of_log]
     return np.sort(np.concatenate([k[i] for k, i in zip(of_log, even, strict=True)]))
 
 
@@ -216,19 +209,21 @@ def transient(shots: Shots) -> np.ndarray:
 
 def judged(cars: dict[str, Car], shots: Shots) -> dict[str, Any]:
     """Errors over the windows, over the steady and the transient ones, and how many spin."""
-    found = fit.errors(cars, shots)
-    lively = transient(shots)
-    whole = {"windows": found["windows"], "errors": found["simulated"]}
-    whole["persistence"] = found["persistence"]
-    for kind, chosen in (("steady", ~lively), ("transient", lively)):
-        whole[kind] = {"windows": int(chosen.sum())}
+    predicted, lively = fit.Problem(cars, shots, ()).predictions(), transient(shots)
+
+    def over(chosen: np.ndarray) -> dict[str, Any]:
+        found: dict[str, Any] = {"windows": int(chosen.sum())}
         if chosen.any():
-            some = fit.errors(cars, fit.select(shots, chosen))
-            whole[kind] |= {"errors": some["simulated"], "persistence": some["persistence"]}
-    simulated = fit.Problem(cars, shots, ()).predictions()
-    motions = zip(shots.measured[:, :3], simulated[:, :3], strict=True)
-    whole["spins"] = belief.spin_count(motions)
-    return whole
+            some = fit.errors(predicted[chosen], fit.select(shots, chosen))
+            found |= {"errors": some["simulated"], "persistence": some["persistence"]}
+        return found
+
+    motions = zip(shots.measured[:, :3], predicted[:, :3], strict=True)
+    return over(np.full(len(lively), True)) | {
+        "steady": over(~lively),
+        "transient": over(lively),
+        "spins": belief.spin_count(motions),
+    }
 
 
 def parameter_row(one: Fitted, runs: Sequence[Run]) -> dict[str, Any]:
@@ -333,7 +328,7 @@ def car_texts(result: Result, about: dict[str, Any], out: Path) -> dict[Path, st
         }
         if about["not_determined"]:
             about_source["not_determined"] = (
-                ", ".join(about["not_determined"]) + ": mostly their prior"
+                ", ".join(about["not_determined"]) + ": the logs hardly tell them"
             )
         if path == out:
             texts[path] = car_text(result.cars[name], about_source)
@@ -398,7 +393,7 @@ def table_lines(about: dict[str, Any]) -> list[str]:
                 error = entry["median_abs_error"]
                 lines.append(f"  {quantity:18} {error:7.3f}  ({still:.3f})")
     for one in about["parameters"]:
-        flag = "" if one["determined"] else "  not determined: left"
+        flag = "" if one["determined"] else "  not determined"
         flag += "  at its bound" if one["at_bound"] else ""
         unit = f"_{one['unit']}" if one["unit"] else ""
         where = one["surface"] or one["run"]

@@ -167,7 +167,7 @@ def _headline(result: Mapping[str, Any]) -> str:
         [escape(str(name)) for name in result[key]] for key in ("not_determined", "at_bounds")
     )
     paragraphs.append(
-        f"<p><b>Not determined</b> by these logs, so much as before: {', '.join(open_)}.</p>"
+        f"<p><b>Not determined</b> by these logs, and hardly moved: {', '.join(open_)}.</p>"
         if open_
         else "<p>The logs determine every parameter that was fitted.</p>"
     )
