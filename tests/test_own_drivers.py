@@ -14,7 +14,7 @@ from countersteer.batch.population import draw, load_population
 from countersteer.car.files import load_car
 from countersteer.cli import DONE, FAILED, WRONG_INPUT, main
 from countersteer.course.files import load_course
-from countersteer.drivers import own
+from countersteer.drivers import optimum, own
 from countersteer.drivers.drift_turn import drift_turn
 from countersteer.errors import InputError
 from countersteer.pilot import Pilot, pilot_of_run
@@ -154,3 +154,17 @@ def test_drives_one_by_one_are_judged_as_a_batch_is(monkeypatch):
     for name in ("outcome", "goal_time", "wall_contacts"):
         np.testing.assert_allclose(getattr(alone, name), getattr(whole, name), atol=1e-6)
     np.testing.assert_allclose(alone.turns.peak_sideslip, whole.turns.peak_sideslip, atol=1e-6)
+
+
+def test_the_stored_optimum_is_the_drive_that_it_is_said_to_be(capsys):
+    for path in optimum.library():
+        about = json.loads(path.with_suffix(".json").read_text())
+        told, course = about["optimum"], about["course"]
+        assert main(["drive", course, "--driver", "optimum", "--json"]) == DONE
+        driven = json.loads(capsys.readouterr().out)
+        assert driven["success"]
+        assert driven["wall_contacts"] == told["wall_contacts"] == 0
+        assert driven["lap_time_s"] == pytest.approx(told["lap_time_s"], abs=0.01)
+        assert driven["lap_time_s"] < about["planner"]["lap_time_s"]
+    assert main(["drive", "ess", "--driver", "optimum"]) == WRONG_INPUT
+    assert "no optimum is stored for 1 lap of ess" in capsys.readouterr().err
