@@ -41,7 +41,7 @@ DIGITS = 6  # decimals of times (s)
 # rms 0.024 m/s at 0.055 s, 0.08 at 0.13 s. It is about half of the 0.1 s over which it counts.
 # Others report 0.09 s, and 0.11 to 0.15 s, for the columns as they are in the file. These hold each
 # reading for 0.1 s, so they are 0.05 s later on average.
-# The encoder's step is read off each log: 0.0413 m/s in August and September 2024, 0.0516 in January.
+# Each log tells its encoder's step: 0.0413 m/s in August and September 2024, 0.0516 in January.
 SENSORS = {
     "encoder": {"lag_s": 0.06, "over_s": 0.1},
     "gyroscope": {"lag_s": 0.05},
