@@ -355,6 +355,18 @@ def test_each_window_and_each_brief_log_is_left_out_once():
         assert not held & fitted
 
 
+def test_a_fit_takes_an_equal_share_of_windows_from_each_log():
+    chosen = tune.spread(np.repeat([0, 1, 4], [5000, 10, 900]))
+    share = tune.MOST // 3
+    logs = np.searchsorted([5000, 5010], chosen, "right")
+    assert np.bincount(logs).tolist() == [share, 10, share]
+    assert np.all(np.diff(chosen) > 0)
+    gaps = np.diff(chosen[logs == 0])
+    assert gaps.max() - gaps.min() <= 1
+    assert chosen[0] == 0
+    assert chosen[-1] == 5909
+
+
 def test_errors_are_pooled_by_log(logs, windows):
     _, cars = logs
     found = folds.judged(cars, windows)
