@@ -242,6 +242,7 @@ def test_a_terminal_is_told_at_once_what_is_started(tmp_path):
         "with progress.waiting('drive box', pathlib.Path(sys.argv[1])):\n"
         "    assert 'jax' not in sys.modules\n"
         "    time.sleep(1.7); print('done')\n"
+        "    progress.clock('judging'); time.sleep(1.7); print('judged')\n"
     )
     memory = tmp_path / "waits.json"
 
@@ -269,8 +270,10 @@ def test_a_terminal_is_told_at_once_what_is_started(tmp_path):
     assert "loading and compiling, 1 s\r" in first
     assert "last time" not in first
     assert "2 s last time" in second
-    assert second.rstrip().endswith("\r\x1b[Kdone")
-    assert list(json.loads(memory.read_text())) == ["drive box"]
+    assert "\r\x1b[Kdone\r\n\r\x1b[Kjudging: starting" in second
+    assert second.count("2 s last time") >= 2
+    assert second.rstrip().endswith("\r\x1b[Kjudged")
+    assert list(json.loads(memory.read_text())) == ["drive box", "judging"]
 
 
 def test_nothing_is_said_where_nobody_looks(tmp_path, capsys):

@@ -465,7 +465,7 @@ def test_times_of_before_that_cannot_be_kept_are_no_matter(tmp_path, memory):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
     (tmp_path / "broken.json").write_bytes(b'{"drive box": 3.\xff')
-    wait = _Wait("drive box", tmp_path / memory)
+    wait = _Wait("drive box", tmp_path / memory, sys.stderr)
     wait._begin -= 10
     wait.end()
     if memory == "broken.json":

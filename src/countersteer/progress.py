@@ -53,21 +53,29 @@ def waiting(what: str, memory: Path) -> Iterator[None]:
     if not sys.stderr.isatty():
         yield
         return
-    wait = _Wait(what, memory)
     streams = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (_First(stream, wait) for stream in streams)
+    shared = _Shared(_Wait(what, memory, sys.stderr))
+    sys.stdout, sys.stderr = (_First(stream, shared) for stream in streams)
     try:
         yield
     finally:
-        wait.end(remember=False)
+        shared.wait.end(remember=False)
         sys.stdout, sys.stderr = streams
+
+
+def clock(what: str) -> None:
+    """Where `waiting` shows a line: one more, until the next output, for a wait in mid-work."""
+    if isinstance(sys.stderr, _First):
+        shared = sys.stderr.shared
+        shared.wait.end()
+        shared.wait = _Wait(what, shared.wait.memory, sys.stderr.stream)
 
 
 class _Wait:
     """The line, in a thread of its own: imports and compilers do not stop it."""
 
-    def __init__(self, what: str, memory: Path) -> None:
-        self._what, self._memory, self._out = what, memory, sys.stderr
+    def __init__(self, what: str, memory: Path, out: Any) -> None:
+        self._what, self.memory, self._out = what, memory, out
         self._begin, self._over = time.monotonic(), threading.Event()
         last = _read(memory).get(what)
         self._last = f", {last:.0f} s last time" if isinstance(last, int | float) else ""
@@ -95,25 +103,32 @@ class _Wait:
         spent = time.monotonic() - self._begin
         if remember and spent > SHORTEST:
             with contextlib.suppress(OSError, InputError):
-                self._memory.parent.mkdir(parents=True, exist_ok=True)
-                text = json.dumps(_read(self._memory) | {self._what: round(spent, 1)})
-                write_whole(self._memory, text)
+                self.memory.parent.mkdir(parents=True, exist_ok=True)
+                text = json.dumps(_read(self.memory) | {self._what: round(spent, 1)})
+                write_whole(self.memory, text)
+
+
+class _Shared:
+    """The wait of now, for both streams."""
+
+    def __init__(self, wait: _Wait) -> None:
+        self.wait = wait
 
 
 class _First:
-    """A stream whose first output ends the wait."""
+    """A stream whose next output ends the wait."""
 
-    def __init__(self, stream: Any, wait: _Wait) -> None:
-        self._stream, self._wait = stream, wait
+    def __init__(self, stream: Any, shared: _Shared) -> None:
+        self.stream, self.shared = stream, shared
 
     def write(self, text: str) -> int:
         """Writes; the wait is over."""
-        self._wait.end()
-        written: int = self._stream.write(text)
+        self.shared.wait.end()
+        written: int = self.stream.write(text)
         return written
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
+        return getattr(self.stream, name)
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from countersteer.cli.options import DONE, Parser, Progress, Verbs, number, out_file
+from countersteer.progress import clock
 
 UNSEEN = 10_000_000  # first seed of the trials that judge what was learned
 
@@ -104,6 +105,12 @@ def say(options: argparse.Namespace, line: str) -> None:
         print(line, flush=True)
 
 
+def say_and_wait(options: argparse.Namespace, line: str, what: str) -> None:
+    """A line that announces a wait, and on a terminal a clock for it until the next output."""
+    say(options, line)
+    clock(f"learn {options.what}, {what}")
+
+
 def in_blocks() -> int:
     """Get JAX ready for batches in one program (`engine.in_one_program`); returns the cores."""
     from countersteer.batch.engine import flags
@@ -179,6 +186,8 @@ def learn_turn(options: argparse.Namespace) -> int:
         )
 
     car, population = load_car(options.car), load_population(options.cars)
+    line = "the first generation compiles for half a minute the first time"
+    say_and_wait(options, line, "first generation")
     policy = search(
         courses,
         car,
@@ -201,7 +210,8 @@ def learn_turn(options: argparse.Namespace) -> int:
     )
     panels = ("success_rate",), ("drift_share",), ("cost",), ("best_cost",)
     save(history, options.out, words, "cpu_s", ("minutes of CPU time", 60.0), panels)
-    say(options, "judging it in new trials, which compiles for half a minute the first time")
+    line = "judging it in new trials, which compiles for half a minute the first time"
+    say_and_wait(options, line, "new trials")
     # Seeds that the search has not used.
     found = verdict(courses, car, population, policy, (UNSEEN + options.seed) % 2**31)
     if options.json:
@@ -257,9 +267,11 @@ def learn_ppo(options: argparse.Namespace) -> int:
     kept = ppo.checkpoint_of(options.out)
     if kept.exists():
         say(options, f"going on from {kept}")
-    say(options, "the first iteration compiles for up to a minute the first time")
+    line = "the first iteration compiles for up to a minute the first time"
+    say_and_wait(options, line, "first iteration")
     curves = ppo.train(job, options.out, cores, report)
-    say(options, "judging it in new trials, which compiles for half a minute the first time")
+    line = "judging it in new trials, which compiles for half a minute the first time"
+    say_and_wait(options, line, "new trials")
     # Seeds that training has not used.
     found = ppo.verdict(job, options.out, UNSEEN + options.seed)
     files = {"policy": str(options.out), "curves": str(options.out.with_suffix(".csv"))}
@@ -320,10 +332,8 @@ def learn_tabular(options: argparse.Namespace) -> int:
     population = load_population(options.cars)
     job = tabular_job(options, course, car, tabular.DIMENSIONS)
     count = len(job.actions.throttle)
-    say(
-        options,
-        f"{job.table.size:,} states, {count} actions; the table compiles for half a minute first",
-    )
+    line = f"{job.table.size:,} states, {count} actions; the table compiles for half a minute first"
+    say_and_wait(options, line, "table")
     with Progress(options.json) as progress:
 
         def report(what: str, value: float) -> None:
@@ -342,7 +352,7 @@ def learn_tabular(options: argparse.Namespace) -> int:
     write_whole(options.out, tabular.policy_file(job, found.solution.values, how, cost))
     rows = [list(row.values()) for row in curve]
     write_whole(options.out.with_suffix(".csv"), csv_text(list(curve[0]), rows))
-    say(options, "judging it, which compiles for a minute the first time")
+    say_and_wait(options, "judging it, which compiles for a minute the first time", "judging")
     driver = learned("tabular", options.out, course, car)
     score, path = nominal_drive(course, car, driver)
     drive = summary(score, Outcome.of(int(score.outcome)))
@@ -391,7 +401,8 @@ def learn_online(options: argparse.Namespace) -> int:
 
     course, car = load_course(options.course), load_car(options.car)
     job = tabular_job(options, course, car, online.DIMENSIONS)
-    say(options, f"{job.table.size:,} states; compiles for a minute or two first")
+    line = f"{job.table.size:,} states; compiles for a minute or two first"
+    say_and_wait(options, line, "first cars")
     learners = online.Online(job, options.seconds)
     found = {}
     with Progress(options.json) as progress:
@@ -465,9 +476,11 @@ def learn_optimum(options: argparse.Namespace) -> int:
     configure_jax(blocks=True, cores=os.cpu_count() or 1)
     course, car, laps = load_course(options.course), load_car(options.car), options.laps
     course.check_laps(laps)
-    say(options, "the planner drives first, some twenty seconds a lap")
+    line = "the planner drives first, some twenty seconds a lap"
+    say_and_wait(options, line, "planner")
     begin = planned(course, car, laps)
-    say(options, "the search begins; its first round compiles for half a minute the first time")
+    line = "the search begins; its first round compiles for half a minute the first time"
+    say_and_wait(options, line, "first round")
     with Progress(options.json) as progress:
         found = best(
             course,
