@@ -21,7 +21,7 @@ from countersteer.runs.importers.units import SIGNALS, UNITS, Unit
 # Words of a column's name for each signal, the surest first, and words that speak against it.
 WORDS = {
     "time": (
-        r"time|stamp|^t$|^t[_ (]+[mun]?s|^s$|^secs?$|^ms$|clock|elapsed|millis|micros",
+        r"time|stamp|^t$|^t[_ (]+[mun]?s|^s$|^secs?$|^ms$|clock|elapsed|millis|micros|epoch",
         r"lap|timer|timeout",
     ),
     "throttle": (r"throttle|^thr|^th$|gas|duty|accelerator|pwm_motor|esc", r"brake|temp|desc"),
