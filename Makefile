@@ -82,6 +82,9 @@ $(DRIVES): pyproject.toml constraints.txt
 		--constraint constraints.txt --editable .
 	@# Python 3.11 puts it into each environment, where nothing needs it.
 	@$(BIN)/python -m pip uninstall --quiet --yes setuptools 2>/dev/null || true
+	@# Tests of others: 20 MB that no drive loads.
+	@find .venv/lib -path '*/site-packages/scipy/*' -name tests -prune -exec rm -r {} +
+	@find .venv/lib -path '*/site-packages/matplotlib/tests' -prune -exec rm -r {} +
 	@touch $(DRIVES)
 
 $(READY): $(DRIVES)

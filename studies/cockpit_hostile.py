@@ -29,8 +29,8 @@ MESSAGES = 10_000
 FLOOD = 100 * PER_SECOND  # messages, in one go
 
 
-def hostile(draw: random.Random) -> str | bytes:
-    """A message that no page sends."""
+def malformed(draw: random.Random) -> str:
+    """A message that is cut short, out of range, of another kind, or random text."""
     kinds = [m.kind_of(cls) for cls in (*m.OF_PAGE, *m.OF_SERVER)]
     values: list[Any] = [
         None, True, -1, 2**70, 1e308, "x" * 200, "../../etc/passwd", [], [[[]]], {}, {"a": {}},
@@ -39,6 +39,16 @@ def hostile(draw: random.Random) -> str | bytes:
     names = [f.name for cls in m.OF_PAGE for f in dataclasses.fields(cls)]
     found = {draw.choice(names): draw.choice(values) for _ in range(draw.randrange(5))}
     text = json.dumps({"kind": draw.choice(kinds), **found})
+    shape = draw.randrange(4)
+    if shape == 0:
+        return text[: draw.randrange(len(text))]
+    if shape == 1:
+        return "".join(chr(draw.randrange(32, 1000)) for _ in range(draw.randrange(80)))
+    return text
+
+
+def hostile(draw: random.Random) -> str | bytes:
+    """A message that no page sends: malformed, or too long, out of order, or bytes."""
     shape = draw.randrange(100)
     if shape == 0:
         return "[" * draw.randrange(1, 100_000)
@@ -48,11 +58,7 @@ def hostile(draw: random.Random) -> str | bytes:
         return json.dumps({"kind": "input", "seq": draw.randrange(-5, 5), "steer": 9.0})
     if shape < 10:
         return draw.randbytes(draw.randrange(200))
-    if shape < 30:
-        return text[: draw.randrange(len(text))]
-    if shape < 50:
-        return "".join(chr(draw.randrange(32, 1000)) for _ in range(draw.randrange(80)))
-    return text
+    return malformed(draw)
 
 
 class Page:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import math
 import random
 import urllib.error
 import urllib.request
@@ -35,6 +34,7 @@ from countersteer.runs.marks import read_mark, write_mark
 from countersteer.runs.run import read_run
 from countersteer.signals import Command
 from countersteer.simulator import Simulator
+from studies.cockpit_hostile import malformed
 
 FORWARD = Hands(0.0, 1.0, 0.0)
 CLOCK: dict[str, Any] = {
@@ -96,29 +96,11 @@ def test_a_wrong_message_is_one_line(text, says):
     assert str(error.value).isprintable()
 
 
-def hostile(draw: random.Random) -> str:
-    """A message that is malformed, out of range, of another kind, or random text."""
-    kinds = [m.kind_of(cls) for cls in (*m.OF_PAGE, *m.OF_SERVER)]
-    values = [
-        None, True, -1, 2**70, 1e308, "x" * 200, "../../etc/passwd", [], [[[]]], {}, {"a": {}},
-        math.inf, "\u0000", [1] * 600, "box", 0.5,
-    ]  # fmt: skip
-    names = [f.name for cls in m.OF_PAGE for f in dataclasses.fields(cls)]
-    found = {draw.choice(names): draw.choice(values) for _ in range(draw.randrange(5))}
-    text = json.dumps({"kind": draw.choice(kinds), **found})
-    shape = draw.randrange(4)
-    if shape == 0:
-        return text[: draw.randrange(len(text))]
-    if shape == 1:
-        return "".join(chr(draw.randrange(32, 1000)) for _ in range(draw.randrange(80)))
-    return text
-
-
 def test_hostile_messages_are_refused_or_read():
     draw, read = random.Random(5), 0
     for _ in range(3000):
         with contextlib.suppress(InputError):
-            parse(hostile(draw))
+            parse(malformed(draw))
             read += 1
     assert 0 < read < 3000
 
@@ -481,7 +463,7 @@ def test_a_slider_changes_the_car_and_the_page_is_told(page):
 def test_hostile_messages_and_a_flood_leave_the_next_drive_as_it_was(address, page, last):
     draw = random.Random(6)
     for _ in range(300):
-        page.socket.send(hostile(draw).replace("control", "contrary"))
+        page.socket.send(malformed(draw).replace("control", "contrary"))
     for _ in range(2 * AT_ONCE):
         page.socket.send("{" * 20)
     page.until("error", lambda e: "too many messages" in e["text"])

@@ -338,6 +338,7 @@ def test_a_guessed_mapping_imports_the_log_that_it_was_guessed_from(tmp_path, ca
         ("t,thr,erpm", "{t},0.4,9000", "wheel_speed", {"unit": "erpm"}),
         ("t_us,thr,v", "{t}e6,0.4,1", "time", {"unit": "us"}),
         ("time,thr,v", "{t}e3,0.4,1", "time", {"unit": "ms"}),
+        ("Epoch_ms,thr,v", "{t}e3,0.4,1", "time", {"column": "Epoch_ms", "unit": "ms"}),
     ],
 )
 def test_units_are_guessed_from_names_and_values(tmp_path, header, row, signal, entry):

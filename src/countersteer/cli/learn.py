@@ -13,6 +13,7 @@ from countersteer.cli.options import DONE, Parser, Progress, Verbs, number, out_
 from countersteer.progress import clock
 
 UNSEEN = 10_000_000  # first seed of the trials that judge what was learned
+IN_NEW_TRIALS = "judging it in new trials, which compiles for half a minute the first time"
 
 
 def add(verbs: Verbs) -> None:
@@ -210,8 +211,7 @@ def learn_turn(options: argparse.Namespace) -> int:
     )
     panels = ("success_rate",), ("drift_share",), ("cost",), ("best_cost",)
     save(history, options.out, words, "cpu_s", ("minutes of CPU time", 60.0), panels)
-    line = "judging it in new trials, which compiles for half a minute the first time"
-    say_and_wait(options, line, "new trials")
+    say_and_wait(options, IN_NEW_TRIALS, "new trials")
     # Seeds that the search has not used.
     found = verdict(courses, car, population, policy, (UNSEEN + options.seed) % 2**31)
     if options.json:
@@ -270,8 +270,7 @@ def learn_ppo(options: argparse.Namespace) -> int:
     line = "the first iteration compiles for up to a minute the first time"
     say_and_wait(options, line, "first iteration")
     curves = ppo.train(job, options.out, cores, report)
-    line = "judging it in new trials, which compiles for half a minute the first time"
-    say_and_wait(options, line, "new trials")
+    say_and_wait(options, IN_NEW_TRIALS, "new trials")
     # Seeds that training has not used.
     found = ppo.verdict(job, options.out, UNSEEN + options.seed)
     files = {"policy": str(options.out), "curves": str(options.out.with_suffix(".csv"))}
@@ -491,6 +490,7 @@ def learn_optimum(options: argparse.Namespace) -> int:
             seed=options.seed,
             report=lambda done, _: progress.show(done, options.rounds),
         )
+    say_and_wait(options, "driving what was found", "judging")
     times = KNOT * np.arange(len(found.commands.throttle))
     rows = command_rows(times, found.commands.throttle, found.commands.steering)
     write_whole(options.out, csv_text(COMMANDS, rows))
