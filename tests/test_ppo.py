@@ -20,6 +20,7 @@ from countersteer.course.files import load_course
 from countersteer.drivers import ppo as network
 from countersteer.drivers.ppo import FEATURES, Layer, read_network
 from countersteer.drivers.stored import fingerprint
+from countersteer.envs.functional import owns
 from countersteer.errors import InputError
 from countersteer.learning import checkpoint, ppo
 from countersteer.learning.ppo import Job, Met, Settings, Trainer, advantages
@@ -94,7 +95,7 @@ def tiny(iterations: int, longest: float, **environment: float) -> tuple[Trainer
         longest=longest,
         entropy=0.0,
     )
-    trainer = Trainer(made, settings, iterations, 1)
+    trainer = Trainer(made, settings, iterations, 1, np.zeros((64, 0), np.float32))
     state = trainer.begin(jnp.zeros(64), 0)
     for _ in range(iterations):
         state, _ = trainer.iterate(state)
@@ -131,12 +132,47 @@ def test_the_best_action_is_found():
     assert np.all(np.exp(state.policy.log_scatter) < ppo.BEGIN_SCATTER)
 
 
+def test_actions_go_on_scattering():
+    """The best action is known here, so the scatter would fall to nothing."""
+    trainer, state = tiny(150, longest=7.0, prize=0.0, wanted=0.6, ends_after=np.inf)
+    np.testing.assert_allclose(
+        np.exp(state.policy.log_scatter), trainer.settings.scatter, rtol=1e-5
+    )
+
+
+def test_the_critics_errors_do_not_slow_the_actor():
+    trainer, state = tiny(1, longest=7.0, prize=0.0, wanted=0.0, ends_after=np.inf)
+    slope = jax.tree.map(np.ones_like, state.policy)
+    steep = slope._replace(critic=jax.tree.map(lambda leaf: 1e4 * leaf, slope.critic))
+    changes = [
+        trainer.optimiser.update(one, trainer.optimiser.init(state.policy), state.policy)[0]
+        for one in (slope, steep)
+    ]
+    for one, other in zip(*(jax.tree.leaves(change.actor) for change in changes), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_the_critic_is_told_what_differs_among_cars():
+    own, _ = owns(load_population("around"), load_car("rx7"), load_course("box"), range(50))
+    told = ppo.numbers_of(own)
+    assert told.shape[0] == 50
+    assert told.shape[1] > 10
+    np.testing.assert_allclose(told.mean(axis=0), 0, atol=1e-5)
+    np.testing.assert_allclose(told.std(axis=0), 1, atol=1e-5)
+    friction = np.asarray(own.car.tires.rear.friction)
+    assert np.abs(np.corrcoef(friction, told, rowvar=False)[0, 1:]).max() > 0.999
+
+
 def test_no_two_decisions_draw_the_same_noise():
     trainer, state = tiny(1, longest=7.0, prize=0.0, wanted=0.0, ends_after=np.inf)
     noises = []
     for iteration in range(4):
         _, met, *_ = trainer._drive(
-            (state.lanes, state.keys), state.policy, trainer.environment, 0, np.int32(iteration)
+            (state.lanes, state.keys, trainer.cars),
+            state.policy,
+            trainer.environment,
+            0,
+            np.int32(iteration),
         )
         mean = network.network(state.policy.actor, met.seen)
         noises.append(np.asarray((met.action - mean) / np.exp(state.policy.log_scatter)))

@@ -14,11 +14,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
 from countersteer.compiling import compiler_flags
+from countersteer.signals import Array
 
 LANES = 128  # of a block of `in_turn`
 CACHED_LANES = 256  # of a block of `in_one_program`: many for the loop's overhead, few for caches
@@ -88,20 +89,38 @@ def in_one_program(
     `own` and the result have a leading axis of lanes. Within `run`, it has the lanes of one block.
     The number of lanes must be a multiple of `lanes` times cores (`whole_blocks`).
     """
-    mesh = all_cores(cores)
 
     def on_core(own: Any, *shared: Any) -> Any:
-        # A block's numbers are one array, so that the loop updates it in place.
-        numbers, unpack = packed(own)
-        shapes = jax.eval_shape(run, jax.tree.map(lambda leaf: leaf[:lanes], own), *shared)
-        empty = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
-        _, unpack_result = packed(empty)
+        mine = in_blocks(own, lanes)
+        first = jax.tree.map(lambda leaf: leaf[0], mine)
+        unpack = unpacking(first)
+        unpack_result = unpacking(jax.eval_shape(run, first, *shared))
 
         def block(numbers: Any) -> Any:
-            return packed(run(jax.vmap(unpack)(numbers), *shared))[0]
+            return packed(run(unpack(numbers), *shared))
 
-        after = jax.lax.map(block, numbers.reshape(-1, lanes, numbers.shape[-1]))
-        return jax.vmap(unpack_result)(after.reshape(-1, after.shape[-1]))
+        after = jax.vmap(unpack_result)(jax.lax.map(block, jax.vmap(packed)(mine)))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), after)
+
+    return _shared_out(on_core, cores)
+
+
+def on_blocks(run: Callable[..., Any], cores: int | None = None) -> Callable[..., Any]:
+    """`run(own, *shared)` for each block, in one program too.
+
+    `own` and the result have a leading axis of blocks, their number a multiple of cores. The loop
+    is fast where they are few arrays: see `packed`.
+    """
+
+    def on_core(own: Any, *shared: Any) -> Any:
+        return jax.lax.map(lambda one: run(one, *shared), own)
+
+    return _shared_out(on_core, cores)
+
+
+def _shared_out(on_core: Callable[..., Any], cores: int | None) -> Callable[..., Any]:
+    """`on_core(own, *shared)`, compiled, each core with its share of `own`."""
+    mesh = all_cores(cores)
 
     def whole(own: Any, *shared: Any) -> Any:
         return on_cores(on_core, mesh, (True, *(False for _ in shared)))(own, *shared)
@@ -109,13 +128,47 @@ def in_one_program(
     return jax.jit(whole)
 
 
-def packed(trees: Any) -> tuple[Any, Callable[[Any], Any]]:
-    """A pytree of lanes as an array (lanes, numbers of one), and the inverse for one lane.
+def in_blocks(trees: Any, lanes: int) -> Any:
+    """Leaves (blocks, lanes, …) from leaves (blocks · lanes, …)."""
+    return jax.tree.map(
+        lambda leaf: leaf.reshape(len(leaf) // lanes, lanes, *leaf.shape[1:]), trees
+    )
 
-    Who calls a program often keeps the array between the calls: packing passes through all memory.
+
+def packed(block: Any) -> tuple[Array, ...]:
+    """A block's leaves (lanes, …) as an array (numbers of a lane, lanes) for each type of number.
+
+    A quantity of all lanes is then a row, read and written in one piece. Who calls a program often
+    keeps the arrays between the calls.
     """
-    _, unpack = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], trees))
-    return jax.vmap(lambda tree: ravel_pytree(tree)[0])(trees), unpack
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(block)]
+    flat = [leaf.reshape(len(leaf), math.prod(leaf.shape[1:])).T for leaf in leaves]
+    return tuple(
+        jnp.concatenate([leaf for leaf in flat if leaf.dtype == kind]) for kind in _kinds(leaves)
+    )
+
+
+def unpacking(like: Any) -> Callable[[tuple[Array, ...]], Any]:
+    """The inverse of `packed`, for blocks as this one."""
+    leaves, form = jax.tree.flatten(like)
+    kinds = _kinds(leaves)
+    shapes = [leaf.shape for leaf in leaves]
+
+    def unpack(arrays: tuple[Array, ...]) -> Any:
+        used, found = [0] * len(kinds), []
+        for leaf, shape in zip(leaves, shapes, strict=True):
+            kind = kinds.index(leaf.dtype)
+            first = used[kind]
+            used[kind] += math.prod(shape[1:])
+            found.append(arrays[kind][first : used[kind]].T.reshape(shape))
+        return jax.tree.unflatten(form, found)
+
+    return unpack
+
+
+def _kinds(leaves: Sequence[Any]) -> list[Any]:
+    """The types of number."""
+    return sorted({leaf.dtype for leaf in leaves}, key=str)
 
 
 def whole_blocks(count: int, lanes: int, cores: int) -> int:

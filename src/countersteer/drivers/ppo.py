@@ -25,11 +25,12 @@ from countersteer.signals import Array, Command, Scalar
 KIND = "ppo"
 FORMAT = 1
 PERIOD = 0.02  # s between two decisions
-PAST = 4  # decisions before, whose commands and motions it is told: how this car answers
+BACK = (1, 2, 3, 4, 6, 8, 11, 16)  # decisions before, of which it is told command and motion:
+PAST = max(BACK)  # from these it can guess grip and servo. So many decisions are kept.
 AHEAD = (0.3, 0.7, 1.2, 1.8, 2.6)  # m along the way, at which it is told the way's points
 SPEED, RATE = 3.0, 6.0  # m/s and rad/s that count as 1
 FAR = 10.0  # no input is beyond
-FEATURES = 6 + 2 * len(AHEAD) + 5 * PAST
+FEATURES = 6 + 2 * len(AHEAD) + 5 * len(BACK)
 MOST_UNITS = 4096
 
 
@@ -95,7 +96,7 @@ def features(way: Way, place: Scalar, seen: Sight, past: Past) -> Array:
         parts += [(cosine * x + sine * y) / distance, (cosine * y - sine * x) / distance]
     sizes = (1.0, 1.0, SPEED, SPEED, RATE)
     for line, size in zip(past, sizes, strict=True):
-        parts += [line[i] / size for i in range(PAST)]
+        parts += [line[-back] / size for back in BACK]
     return jnp.clip(jnp.stack(parts), -FAR, FAR)
 
 

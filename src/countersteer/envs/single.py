@@ -46,7 +46,7 @@ class DriftEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Action (2,) in ±1: throttle (negative: brake, reverse), steering to the left (±1: full lock).
     Observation `state`: `drivers.ppo.features` of the true state. Observation `sensors`: the
     last value of each of the car's channels, in their order (`observation_names`), then the last
-    four throttles and steerings. `info` has the reward's `terms`, the `outcome`, the `turns`' peak
+    16 throttles and steerings. `info` has the reward's `terms`, the `outcome`, the `turns`' peak
     sideslip and overshoot (rad), and at `reset` the `seed` that drew the car.
     """
 

@@ -85,13 +85,16 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         keys = jax.random.split(root, self._lanes)
         state, seen = self._reset(self._environment, own, keys, np.int32(0))
         self._keys, self._tick = jax.random.key_data(keys), 0
-        # What a car is stays; how it moves goes in and out of each step, as one array.
-        self._own, own_of = engine.packed(own)
+        # What a car is stays; how it moves goes in and out of each step, in one piece.
         nothing: Any = ()
-        self._state, lane_of = engine.packed(state._replace(own=nothing))
+        parts = [engine.in_blocks(part, self._block) for part in (own, state._replace(own=nothing))]
+        self._own, self._state = (jax.jit(jax.vmap(engine.packed))(part) for part in parts)
         if slots != self._slots:
+            own_of, lane_of = (
+                engine.unpacking(jax.tree.map(lambda leaf: leaf[0], part)) for part in parts
+            )
             stepped = functools.partial(_step, own_of, lane_of)
-            self._step = engine.in_one_program(stepped, lanes=self._block, cores=self._cores)
+            self._step = engine.on_blocks(stepped, self._cores)
             self._slots = slots
         self._done = np.zeros(self._lanes, np.float32)
         return np.asarray(seen)[: self.num_envs], {}
@@ -102,10 +105,12 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         """One decision of 20 ms of all cars; `infos` has the reward's terms and the outcomes."""
         full = np.zeros((self._lanes, 2), np.float32)
         full[: self.num_envs] = actions
-        own = (self._own, self._state, self._keys, full, self._done)
+        others = engine.in_blocks((self._keys, full, self._done), self._block)
+        own = (self._own, self._state, *others)
         self._state, told = self._step(own, self._environment, np.int32(self._tick))
         self._tick += self._environment.ticks
-        seen, terms, ended, time, outcome = np.split(np.asarray(told), PARTS, axis=1)
+        told = np.asarray(told).reshape(self._lanes, -1)
+        seen, terms, ended, time, outcome = np.split(told, PARTS, axis=1)
         over = ended[:, 0] > 0
         late = (time[:, 0] >= self.longest - 1e-4) & ~over
         self._done = (late | over).astype(np.float32)
@@ -120,20 +125,19 @@ PARTS = np.cumsum([FEATURES, len(Reward._fields), 1, 1])
 
 
 def _step(
-    own_of: Callable[[Array], Own],
-    lane_of: Callable[[Array], Lane],
-    own: tuple[Array, Array, Array, Array, Array],
+    own_of: Callable[[Any], Own],
+    lane_of: Callable[[Any], Lane],
+    block: tuple[Any, Any, Array, Array, Array],
     environment: Environment,
     tick: Scalar,
-) -> tuple[Array, Array]:
+) -> tuple[Any, Array]:
     """A block's decision. Lanes that had ended begin a new episode instead.
 
     Returns the packed lanes, and what is told of each (`PARTS`).
     """
     apart: Any = ()  # what a car is does not change
 
-    def one(car: Array, state: Array, key: Array, action: Array, done: Scalar) -> Any:
-        lane = lane_of(state)._replace(own=own_of(car))
+    def one(lane: Lane, key: Array, action: Array, done: Scalar) -> tuple[Lane, Array]:
         after, _, terms, ended = environment.step(lane, action, tick)
         own_key = jax.random.fold_in(jax.random.wrap_key_data(key), tick)
         fresh = jax.random.uniform(own_key, (5,), jnp.float32)
@@ -143,5 +147,6 @@ def _step(
         told = jnp.concatenate([environment.observe(after), paid, rest])
         return after._replace(own=apart), told
 
-    lanes, told = jax.vmap(one)(*own)
-    return engine.packed(lanes)[0], told
+    own, state, *others = block
+    lanes, told = jax.vmap(one)(lane_of(state)._replace(own=own_of(own)), *others)
+    return engine.packed(lanes), told

@@ -4,9 +4,14 @@ An iteration drives all lanes for `steps` decisions, then takes `epochs` passes 
 they met. A lane that has driven for too long is stopped only between iterations. There the value
 of where it stands is known, so a limit of time counts as no end. The learning rate falls to 0, and
 the policy that is kept is a running mean of the last parameters: neighbouring ones differ much.
+Actions never scatter less than `scatter`: where they hardly do, what a decision was worth is lost
+in the noise of what follows, and a long training gets worse again.
 
-Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.06347, 2017, and
-High-Dimensional Continuous Control Using Generalized Advantage Estimation, arXiv:1506.02438, 2015.
+The critic is only needed to learn. So it is told what the actor has to guess: the car of the lane.
+
+Sources: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.06347, 2017, and
+High-Dimensional Continuous Control Using Generalized Advantage Estimation, arXiv:1506.02438, 2015;
+L. Pinto et al., Asymmetric Actor Critic for Image-Based Robot Learning, arXiv:1710.06542, 2017.
 """
 
 import dataclasses
@@ -65,7 +70,8 @@ class Settings:
     trace: float = 0.95  # lambda of the advantages
     entropy: float = 0.002
     value: float = 0.5  # weight of the value's loss
-    norm: float = 0.5  # largest norm of a gradient
+    norm: float = 0.5  # largest norm of the actor's gradient
+    scatter: float = 0.2  # least standard deviation of actions, in full commands
     mean: float = 0.02  # part of the running mean that the newest parameters are
     longest: float = LONGEST  # s of an episode
 
@@ -122,13 +128,18 @@ def layers(key: Array, sizes: tuple[int, ...], last: float) -> tuple[Layer, ...]
     return tuple(found)
 
 
-def first_policy(key: Array) -> Policy:
-    """A policy that rolls on slowly, and tries much."""
+def first_policy(key: Array, told: int) -> Policy:
+    """A policy that rolls on slowly, and tries much. `told`: numbers of a car."""
     a, c = jax.random.split(key)
     actor = layers(a, (FEATURES, *UNITS, 2), 0.01)
     rolls = Layer(actor[-1].weight, actor[-1].bias.at[0].set(CREEP))
     scatter = jnp.full(2, math.log(BEGIN_SCATTER), jnp.float32)
-    return Policy((*actor[:-1], rolls), layers(c, (FEATURES, *UNITS, 1), 1.0), scatter)
+    return Policy((*actor[:-1], rolls), layers(c, (FEATURES + told, *UNITS, 1), 1.0), scatter)
+
+
+def worth(policy: Policy, seen: Array, cars: Array) -> Array:
+    """The critic's values (…,) of observations and cars."""
+    return network(policy.critic, jnp.concatenate([seen, cars], axis=-1))[..., 0]
 
 
 def log_chance(mean: Array, log_scatter: Array, action: Array) -> Array:
@@ -153,12 +164,12 @@ def advantages(met: Met, last: Array, discount: float, trace: float) -> tuple[Ar
 
 def loss(settings: Settings, policy: Policy, batch: tuple[Array, ...]) -> Scalar:
     """PPO's loss of a batch of decisions."""
-    seen, action, before, advantage, goal = batch
+    seen, cars, action, before, advantage, goal = batch
     now = log_chance(network(policy.actor, seen), policy.log_scatter, action)
     ratio = jnp.exp(now - before)
     clipped = jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip)
     gain = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
-    value = network(policy.critic, seen)[:, 0]
+    value = worth(policy, seen, cars)
     entropy = jnp.sum(policy.log_scatter)
     return settings.value * jnp.mean((value - goal) ** 2) - gain - settings.entropy * entropy
 
@@ -167,16 +178,30 @@ class Trainer:
     """PPO on an environment, compiled for all cores."""
 
     def __init__(
-        self, environment: Environment, settings: Settings, iterations: int, cores: int
+        self,
+        environment: Environment,
+        settings: Settings,
+        iterations: int,
+        cores: int,
+        cars: np.ndarray,
     ) -> None:
-        """`iterations` is the whole number: the learning rate falls to 0 with it."""
+        """`iterations` is the whole number: the learning rate falls to 0 with it.
+
+        `cars` (lanes, n) is what the critic is told of each lane's car.
+        """
         self.environment, self.settings, self.iterations = environment, settings, iterations
         self.mesh = engine.all_cores(cores)
+        self.cars = jax.device_put(cars, NamedSharding(self.mesh, PartitionSpec("core")))
         schedule = optax.linear_schedule(
             settings.rate, 0.0, iterations * settings.epochs * settings.batches
         )
-        self.optimiser = optax.chain(
-            optax.clip_by_global_norm(settings.norm), optax.adam(schedule, eps=1e-5)
+        adam = optax.adam(schedule, eps=1e-5)
+        # Each by itself: the critic's gradient is a hundred times the actor's, and largest where
+        # cars fail. With one norm for both, the actor would learn least from failures.
+        each: tuple[Any, ...] = ("actor", "critic", "actor")
+        self.optimiser = optax.partition(
+            {"actor": optax.chain(optax.clip_by_global_norm(settings.norm), adam), "critic": adam},
+            Policy(*each),
         )
         block = min(engine.CACHED_LANES, settings.lanes // cores)
         self._drive = engine.in_one_program(self._drive_block, lanes=block, cores=cores)
@@ -191,7 +216,8 @@ class Trainer:
     def begin(self, own: Own, seed: int) -> Training:
         """Before the first iteration; leaves of `own` have a leading axis of lanes."""
         root = jax.random.key(seed)
-        policy = jax.jit(first_policy)(jax.random.fold_in(root, 0))
+        first = jax.jit(first_policy, static_argnums=1)
+        policy = first(jax.random.fold_in(root, 0), self.cars.shape[1])
         keys = jax.random.split(jax.random.fold_in(root, 1), self.settings.lanes)
         lanes, _ = self._begin(own, keys, jnp.int32(0))
         return self.placed(
@@ -221,14 +247,20 @@ class Trainer:
         """One iteration, and its figures."""
         tick = np.int32(int(training.iteration) * self.settings.steps * self.environment.ticks)
         (lanes, met, last, told) = self._drive(
-            (training.lanes, training.keys),
+            (training.lanes, training.keys, self.cars),
             training.policy,
             self.environment,
             tick,
             training.iteration,
         )
         policy, mean, optimiser = self._learn(
-            training.policy, training.mean, training.optimiser, met, last, training.iteration
+            training.policy,
+            training.mean,
+            training.optimiser,
+            met,
+            last,
+            self.cars,
+            training.iteration,
         )
         after = Training(
             policy, mean, optimiser, lanes, training.keys, training.iteration + np.int32(1)
@@ -237,14 +269,14 @@ class Trainer:
 
     def _drive_block(
         self,
-        own: tuple[Lane, Array],
+        own: tuple[Lane, Array, Array],
         policy: Policy,
         environment: Environment,
         tick: Scalar,
         iteration: Scalar,
     ) -> tuple[Lane, Met, Array, Told]:
         """A block of lanes, driven for `steps` decisions."""
-        lanes, keys = own
+        lanes, keys, cars = own
         settings = self.settings
         number = iteration * (2 * settings.steps + 1)  # two draws a step, and one at the end
 
@@ -261,7 +293,7 @@ class Trainer:
             mean = network(policy.actor, seen)
             noise = drawn(2 * step, (2,), jax.random.normal)
             action = mean + jnp.exp(policy.log_scatter) * noise
-            value = network(policy.critic, seen)[:, 0]
+            value = worth(policy, seen, cars)
             lanes, _, terms, ended = jax.vmap(environment.step, (0, 0, None))(lanes, action, now)
             met = Met(
                 seen,
@@ -279,7 +311,7 @@ class Trainer:
 
         begin = (lanes, jax.vmap(environment.observe)(lanes))
         (lanes, seen), (met, told) = jax.lax.scan(one, begin, jnp.arange(settings.steps))
-        last = network(policy.critic, seen)[:, 0]
+        last = worth(policy, seen, cars)
         # A limit of time is no end: the value of where the lane stands has been taken.
         end = tick + settings.steps * environment.ticks
         late = jnp.where(lanes.score.time > settings.longest, 1.0, 0.0)
@@ -295,7 +327,13 @@ class Trainer:
         size = per_core // settings.batches
 
         def on_core(
-            policy: Policy, mean: Policy, state: Any, met: Met, last: Array, iteration: Scalar
+            policy: Policy,
+            mean: Policy,
+            state: Any,
+            met: Met,
+            last: Array,
+            cars: Array,
+            iteration: Scalar,
         ) -> tuple[Policy, Policy, Any]:
             by_step = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), met)
             advantage, goal = advantages(by_step, last, settings.discount, settings.trace)
@@ -303,6 +341,7 @@ class Trainer:
             wide = jnp.sqrt(jax.lax.pmean(jnp.mean((advantage - off) ** 2), "core")) + 1e-8
             columns = (
                 by_step.seen,
+                jnp.broadcast_to(cars, (settings.steps, *cars.shape)),
                 by_step.action,
                 by_step.log_chance,
                 (advantage - off) / wide,
@@ -321,6 +360,8 @@ class Trainer:
                     slope = jax.lax.pmean(slope, "core")
                     change, state = self.optimiser.update(slope, state, policy)
                     policy = optax.apply_updates(policy, change)
+                    least = jnp.maximum(policy.log_scatter, math.log(settings.scatter))
+                    policy = policy._replace(log_scatter=least)
                     return (policy, mean, state), None
 
                 return jax.lax.scan(batch, carry, order.reshape(settings.batches, size))
@@ -338,7 +379,7 @@ class Trainer:
             jax.shard_map(
                 on_core,
                 mesh=mesh,
-                in_specs=(same, same, same, cut, cut, same),
+                in_specs=(same, same, same, cut, cut, cut, same),
                 out_specs=same,
                 check_vma=False,
             )
@@ -407,6 +448,14 @@ def checkpoint_of(out: Path) -> Path:
     return out.with_suffix(".checkpoint.npz")
 
 
+def numbers_of(own: Own) -> np.ndarray:
+    """What differs among the cars and their charges (lanes, n): mean 0, standard deviation 1."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((own.car, own.charge))]
+    of_lanes = [leaf for leaf in leaves if leaf.ndim == 1]
+    found = [leaf for leaf in of_lanes if leaf.std() > 1e-6 * np.abs(leaf).max()]
+    return np.stack([(leaf - leaf.mean()) / leaf.std() for leaf in found], axis=1)
+
+
 def train(
     job: Job,
     out: Path,
@@ -424,7 +473,7 @@ def train(
     own, slots = owns(job.population, job.car, job.course, seeds)
     environment = Environment.of(job.course, job.car, job.weights, slots, rolling=ROLLING)
     iterations = math.ceil(job.samples / (settings.lanes * settings.steps))
-    trainer = Trainer(environment, settings, iterations, cores)
+    trainer = Trainer(environment, settings, iterations, cores, numbers_of(own))
     kept = checkpoint_of(out)
     about = {
         "fingerprint": fingerprint(job.course, job.car),
