@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("optax", reason="optax is not installed")
 
 from countersteer import cli
+from countersteer.batch import engine
 from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.car.parameter import pytree
@@ -125,19 +126,14 @@ def test_an_end_is_an_end():
 
 
 def test_the_best_action_is_found():
-    _, state = tiny(150, longest=7.0, prize=0.0, wanted=0.6, ends_after=np.inf)
+    trainer, state = tiny(150, longest=7.0, prize=0.0, wanted=0.6, ends_after=np.inf)
     for layers in (state.policy.actor, state.mean.actor):
         out = np.asarray(network.network(layers, jnp.zeros(FEATURES)))
         np.testing.assert_allclose(out, 0.6, atol=0.08)
-    assert np.all(np.exp(state.policy.log_scatter) < ppo.BEGIN_SCATTER)
-
-
-def test_actions_go_on_scattering():
-    """The best action is known here, so the scatter would fall to nothing."""
-    trainer, state = tiny(150, longest=7.0, prize=0.0, wanted=0.6, ends_after=np.inf)
-    np.testing.assert_allclose(
-        np.exp(state.policy.log_scatter), trainer.settings.scatter, rtol=1e-5
-    )
+    # Any scatter costs here, so it falls as far as it may.
+    assert trainer.settings.scatter < ppo.BEGIN_SCATTER
+    scatter = np.exp(state.policy.log_scatter)
+    np.testing.assert_allclose(scatter, trainer.settings.scatter, rtol=1e-5)
 
 
 def test_the_critics_errors_do_not_slow_the_actor():
@@ -161,6 +157,24 @@ def test_the_critic_is_told_what_differs_among_cars():
     np.testing.assert_allclose(told.std(axis=0), 1, atol=1e-5)
     friction = np.asarray(own.car.tires.rear.friction)
     assert np.abs(np.corrcoef(friction, told, rowvar=False)[0, 1:]).max() > 0.999
+
+
+def test_of_cars_that_are_all_alike_the_critic_is_told_nothing():
+    own, _ = owns(load_population("around"), load_car("rx7"), load_course("box"), [7] * 4)
+    assert ppo.numbers_of(own).shape == (4, 0)
+
+
+def test_numbers_of_a_block_come_back_as_they_were():
+    """Also keys, of which a number of 32 bits would not hold the last digits."""
+    rng = np.random.default_rng(0)
+    block = {
+        "key": rng.integers(2**32, size=(8, 2), dtype=np.uint32),
+        "speed": rng.normal(size=8).astype(np.float32),
+        "line": rng.normal(size=(8, 3, 2)).astype(np.float32),
+    }
+    arrays = engine.packed(block)
+    assert [array.shape for array in arrays] == [(7, 8), (2, 8)]
+    jax.tree.map(np.testing.assert_array_equal, engine.unpacking(block)(arrays), block)
 
 
 def test_no_two_decisions_draw_the_same_noise():

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from countersteer.compiling import compiler_flags
 from countersteer.signals import Array
@@ -39,6 +39,14 @@ def flags(cores: int) -> str:
 def all_cores(cores: int | None = None) -> Mesh:
     """A mesh of the first `cores` of JAX's devices, by default of all."""
     return Mesh(np.array(jax.devices()[:cores]), ("core",))
+
+
+def shared_out(trees: Any, cores: int | None = None) -> Any:
+    """The same leaves, each core with its share of the leading axis.
+
+    What goes into many calls of a program is placed once, or each call moves it again.
+    """
+    return jax.device_put(trees, NamedSharding(all_cores(cores), PartitionSpec("core")))
 
 
 def on_cores(run: Callable[..., Any], mesh: Mesh, lanes: Sequence[bool]) -> Callable[..., Any]:
@@ -102,7 +110,7 @@ def in_one_program(
         after = jax.vmap(unpack_result)(jax.lax.map(block, jax.vmap(packed)(mine)))
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), after)
 
-    return _shared_out(on_core, cores)
+    return _compiled(on_core, cores)
 
 
 def on_blocks(run: Callable[..., Any], cores: int | None = None) -> Callable[..., Any]:
@@ -115,10 +123,10 @@ def on_blocks(run: Callable[..., Any], cores: int | None = None) -> Callable[...
     def on_core(own: Any, *shared: Any) -> Any:
         return jax.lax.map(lambda one: run(one, *shared), own)
 
-    return _shared_out(on_core, cores)
+    return _compiled(on_core, cores)
 
 
-def _shared_out(on_core: Callable[..., Any], cores: int | None) -> Callable[..., Any]:
+def _compiled(on_core: Callable[..., Any], cores: int | None) -> Callable[..., Any]:
     """`on_core(own, *shared)`, compiled, each core with its share of `own`."""
     mesh = all_cores(cores)
 

@@ -67,6 +67,7 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self._lanes = engine.whole_blocks(num_envs, block, cores)
         self._block, self._cores, self._slots = block, cores, -1
         self._reset = jax.jit(jax.vmap(Environment.reset, (None, 0, 0, None)))
+        self._pack = jax.jit(jax.vmap(engine.packed))
 
     def reset(
         self,
@@ -84,11 +85,12 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         root = jax.random.key(first % 2**31)
         keys = jax.random.split(root, self._lanes)
         state, seen = self._reset(self._environment, own, keys, np.int32(0))
-        self._keys, self._tick = jax.random.key_data(keys), 0
+        self._tick = 0
         # What a car is stays; how it moves goes in and out of each step, in one piece.
         nothing: Any = ()
         parts = [engine.in_blocks(part, self._block) for part in (own, state._replace(own=nothing))]
-        self._own, self._state = (jax.jit(jax.vmap(engine.packed))(part) for part in parts)
+        blocks = (*map(self._pack, parts), engine.in_blocks(jax.random.key_data(keys), self._block))
+        self._own, self._state, self._keys = engine.shared_out(blocks, self._cores)
         if slots != self._slots:
             own_of, lane_of = (
                 engine.unpacking(jax.tree.map(lambda leaf: leaf[0], part)) for part in parts
@@ -105,8 +107,8 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         """One decision of 20 ms of all cars; `infos` has the reward's terms and the outcomes."""
         full = np.zeros((self._lanes, 2), np.float32)
         full[: self.num_envs] = actions
-        others = engine.in_blocks((self._keys, full, self._done), self._block)
-        own = (self._own, self._state, *others)
+        asked = engine.in_blocks((full, self._done), self._block)
+        own = (self._own, self._state, self._keys, *asked)
         self._state, told = self._step(own, self._environment, np.int32(self._tick))
         self._tick += self._environment.ticks
         told = np.asarray(told).reshape(self._lanes, -1)

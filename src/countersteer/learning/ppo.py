@@ -191,7 +191,7 @@ class Trainer:
         """
         self.environment, self.settings, self.iterations = environment, settings, iterations
         self.mesh = engine.all_cores(cores)
-        self.cars = jax.device_put(cars, NamedSharding(self.mesh, PartitionSpec("core")))
+        self.cars = engine.shared_out(cars, cores)
         schedule = optax.linear_schedule(
             settings.rate, 0.0, iterations * settings.epochs * settings.batches
         )
@@ -233,15 +233,11 @@ class Trainer:
 
     def placed(self, training: Training) -> Training:
         """The same on the cores: lanes cut, the rest on each."""
-        same = NamedSharding(self.mesh, PartitionSpec())
-        cut = NamedSharding(self.mesh, PartitionSpec("core"))
-        own = ("lanes", "keys")
-        return Training(
-            *(
-                jax.device_put(getattr(training, name), cut if name in own else same)
-                for name in Training._fields
-            )
-        )
+        lanes, keys = engine.shared_out((training.lanes, training.keys), self.mesh.size)
+        apart: Any = None
+        rest = training._replace(lanes=apart, keys=apart)
+        same = jax.device_put(rest, NamedSharding(self.mesh, PartitionSpec()))
+        return same._replace(lanes=lanes, keys=keys)
 
     def iterate(self, training: Training) -> tuple[Training, dict[str, float]]:
         """One iteration, and its figures."""
@@ -450,10 +446,11 @@ def checkpoint_of(out: Path) -> Path:
 
 def numbers_of(own: Own) -> np.ndarray:
     """What differs among the cars and their charges (lanes, n): mean 0, standard deviation 1."""
+    lanes = np.shape(own.charge)
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((own.car, own.charge))]
-    of_lanes = [leaf for leaf in leaves if leaf.ndim == 1]
-    found = [leaf for leaf in of_lanes if leaf.std() > 1e-6 * np.abs(leaf).max()]
-    return np.stack([(leaf - leaf.mean()) / leaf.std() for leaf in found], axis=1)
+    found = [one for one in leaves if one.shape == lanes and one.std() > 1e-6 * np.abs(one).max()]
+    scaled = [(leaf - leaf.mean()) / leaf.std() for leaf in found]
+    return np.array(scaled, np.float32).reshape(len(found), *lanes).T
 
 
 def train(

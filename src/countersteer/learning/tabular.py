@@ -353,10 +353,8 @@ class Solver:
         # Each core has as many motions: the first ones fill up.
         rows = np.arange(math.ceil(self.count / cores) * cores) % self.count
         self.size = len(rows)
-        cut = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("core"))
-        self.table = jax.tree.map(
-            lambda leaf: jax.device_put(leaf if len(leaf) == len(rows) else leaf[rows], cut), table
-        )
+        whole = jax.tree.map(lambda leaf: leaf if len(leaf) == len(rows) else leaf[rows], table)
+        self.table = engine.shared_out(whole, cores)
         shared, own = False, True
         self._improve = jax.jit(engine.on_cores(self._best, mesh, (shared, own)))
         self._hold = jax.jit(engine.on_cores(self._held, mesh, (shared, own, own)))
