@@ -1,7 +1,8 @@
 """The planner with cars that differ from the one it knows: the table of docs/planning.md.
 
-A bend is a stretch of the rounded centre line with a radius under 5 m. Where the car's sideslip in
-a bend stays under 25°, it goes round by grip.
+Where the car's sideslip in a turn, as the judge finds it, stays under 25°, it goes round by grip. A
+race track has no corners for the judge; there a bend is told instead, a stretch of the rounded
+centre line with a radius under 5 m.
 
 It plans with the nominal model; each car is a random one of the set `around`. It knows where it is
 (the estimator `truth`). Drives are computed one after another, in as many processes as cores.
@@ -54,6 +55,8 @@ def drives(name: str, seeds: range) -> list[dict[str, Any]]:
     pilot = Pilot.of(Mppi(course, car), course, car, "truth")
     task = Task.of(course, 1, walls_end=True)
     points, bends = bends_of(course)
+    if task.corners.angle.size:
+        bends = []
     line = KDTree(points)
     found = []
     for i, seed in enumerate(seeds):
@@ -85,7 +88,7 @@ def drives(name: str, seeds: range) -> list[dict[str, Any]]:
                 "outcome": Outcome.of(score.outcome).value,
                 "furthest": float(score.furthest),
                 "lap": float(score.goal_time),
-                "sideslip": slips,
+                "sideslip": slips if bends else np.degrees(score.turns.peak_sideslip),
                 "overshoot": np.degrees(score.turns.overshoot),
             }
         )
@@ -112,12 +115,15 @@ def main(name: str, cars: int = CARS, first: int = FIRST) -> int:
     over = np.concatenate([one["overshoot"] for one in round_])
     if len(over):
         print(f"  overshoot {np.median(over):.0f}°, 95th percentile {np.percentile(over, 95):.0f}°")
-    _, bends = bends_of(load_course(name))
+    course = load_course(name)
+    places = [f"bend of {SPACING * a:.1f} to {SPACING * b:.1f} m" for a, b in bends_of(course)[1]]
+    if len(over):
+        places = [f"turn at {turn.distance:.1f} m" for turn in course.turns_ahead(1)]
     slips = np.array([one["sideslip"] for one in round_])
-    for k, (first, last) in enumerate(bends):
+    for place, slip in zip(places, slips.T, strict=True):
         print(
-            f"  bend {k + 1}, {SPACING * first:.1f} to {SPACING * last:.1f} m: sideslip "
-            f"{np.median(slips[:, k]):.0f}°, drifts {100 * np.mean(slips[:, k] > DRIFT):.0f} %"
+            f"  {place}: sideslip {np.median(slip):.0f}°, "
+            f"drifts {100 * np.mean(slip > DRIFT):.0f} %"
         )
     return 0
 

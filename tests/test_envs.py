@@ -12,8 +12,9 @@ from countersteer.batch.population import load_population
 from countersteer.car.files import load_car
 from countersteer.course.files import load_course
 from countersteer.drivers.ppo import FEATURES
-from countersteer.task.judge import Outcome
-from countersteer.task.reward import DRIFTING, PAPER, Reward
+from countersteer.signals import Command
+from countersteer.task.judge import STALLED, Outcome
+from countersteer.task.reward import DRIFTING, PAPER, Reward, reward
 
 gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
 
@@ -123,6 +124,35 @@ def test_the_functional_environment_is_the_simulator():
             if terminated:
                 break
         assert k > 50
+
+
+def test_what_the_critic_is_told_of_the_judge_is_what_the_reward_depends_on():
+    car, course = load_car("rx7"), load_course("box")
+    made = Environment.of(course, car, DRIFTING, planar.delay_slots(car, 0.001))
+    own = Own(car, None, jnp.float32(1.0), jnp.asarray(course.start, jnp.float32))
+    lane, _ = made.reset(own, jax.random.key(0), 0)
+    turns = lane.score.turns._replace(
+        begin=jnp.array([1.0, 2.0, jnp.inf, jnp.inf]),
+        peak_sideslip=jnp.radians(jnp.array([20.0, 40.0, 0.0, 0.0])),
+        overshoot=jnp.array([0.1, 0.2, 0.0, 0.0]),
+    )
+    far = lane.score.furthest + 5
+    score = lane.score._replace(furthest=far, turns=turns, time=3.0, furthest_at=2.0)
+    none = Command(0.0, 0.0)
+    terms = reward(DRIFTING, made.task, lane.score, score, none, none)
+    before, after = (made.judged(lane._replace(score=one)) for one in (lane.score, score))
+    assert before.shape == (3 + 5 * 4,)
+    left, waited, reached = after[:3]
+    gone = (float(before[0]) - left) / 4 * (course.lap_end(1) - course.start_distance)
+    assert float(terms.progress) == pytest.approx(DRIFTING.progress * float(gone), rel=1e-5)
+    assert float(waited) == pytest.approx(1 / STALLED)
+    assert reached == 0
+    begun, ended, slips, drifts, overshoots = np.asarray(after[3:]).reshape(5, 4)
+    np.testing.assert_array_equal(begun, [1, 1, 0, 0])
+    np.testing.assert_array_equal(ended, 0)
+    assert float(terms.sideslip) == pytest.approx(DRIFTING.sideslip * np.sum(np.minimum(slips, 1)))
+    assert float(terms.drift) == DRIFTING.drift * np.sum(drifts) == DRIFTING.drift
+    assert float(terms.overshoot) == pytest.approx(DRIFTING.overshoot * np.sum(overshoots))
 
 
 def test_the_terms_of_the_reward_add_up_to_what_the_judge_says():

@@ -65,6 +65,9 @@ class Tiny:
     def observe(self, lane):
         return jnp.zeros(FEATURES).at[0].set(lane.at / 10)
 
+    def judged(self, lane):
+        return jnp.zeros_like(lane.at)[None][:0]
+
     def step(self, lane, action, tick):
         del tick
         at = lane.at + 1
@@ -202,7 +205,9 @@ def test_advantages_are_those_of_a_plain_loop():
     reward, values = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))
     ended, last = rng.uniform(size=(7, 3)) < 0.3, rng.normal(size=3)
     none = jnp.zeros((7, 3))
-    met = Met(none, none, none, jnp.asarray(values), jnp.asarray(reward), jnp.asarray(ended, float))
+    met = Met(
+        none, none, none, none, jnp.asarray(values), jnp.asarray(reward), jnp.asarray(ended, float)
+    )
     found, goal = advantages(met, jnp.asarray(last), 0.95, 0.9)
     expected, running = np.zeros((7, 3)), np.zeros(3)
     for k in reversed(range(7)):

@@ -22,10 +22,10 @@ from countersteer.car.car import Car
 from countersteer.car.parameter import pytree
 from countersteer.course.course import Course
 from countersteer.course.way import Way, start_of, way_of
-from countersteer.drivers.ppo import PERIOD, Past, Sight, features, full_lock
+from countersteer.drivers.ppo import FAR, PERIOD, Past, Sight, features, full_lock
 from countersteer.signals import Array, Command, Scalar
-from countersteer.task.judge import Outcome, Sample, Score, Task
-from countersteer.task.reward import Reward, reward
+from countersteer.task.judge import DRIFT, STALLED, Outcome, Sample, Score, Task
+from countersteer.task.reward import ENOUGH, Reward, reward
 from countersteer.world import planar
 from countersteer.world.floor import Floor
 from countersteer.world.state import State
@@ -137,6 +137,25 @@ class Environment:
     def observe(self, lane: Lane) -> Array:
         """The observation (FEATURES,)."""
         return features(self.way, lane.place, sight_of(lane), lane.past)
+
+    def judged(self, lane: Lane) -> Array:
+        """What the reward depends on beside the motion (3 + 5 · turns,), each about 1 in size.
+
+        The way left, the time without progress, whether the goal is behind; for each turn whether
+        it has begun and ended, its sideslip so far, whether that is a drift, and its overshoot.
+        """
+        score, turns = lane.score, lane.score.turns
+        left = (self.task.goal - score.furthest) / (self.task.goal - self.task.start)
+        waited = (score.time - score.furthest_at) / STALLED
+        parts = [
+            jnp.stack([4 * left - 2, waited, jnp.isfinite(score.goal_time)]),
+            jnp.isfinite(turns.begin),
+            jnp.isfinite(turns.end),
+            turns.peak_sideslip / ENOUGH,
+            turns.peak_sideslip > DRIFT,
+            turns.overshoot,
+        ]
+        return jnp.clip(jnp.concatenate(parts), -FAR, FAR)
 
     def step(self, lane: Lane, action: Array, tick: Scalar) -> tuple[Lane, Array, Reward, Scalar]:
         """One decision from a tick on: lane, observation, terms of the reward, and end.

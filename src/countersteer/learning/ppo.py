@@ -7,7 +7,9 @@ the policy that is kept is a running mean of the last parameters: neighbouring o
 Actions never scatter less than `scatter`: where they hardly do, what a decision was worth is lost
 in the noise of what follows, and a long training gets worse again.
 
-The critic is only needed to learn. So it is told what the actor has to guess: the car of the lane.
+The critic is only needed to learn. So it is told what the actor has to guess, the car of the lane,
+and what else the reward depends on: how far the goal is, and what the turns have been paid. Without
+that it expects to be paid for a slide again, and every arrival at the goal seems a loss.
 
 Sources: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.06347, 2017, and
 High-Dimensional Continuous Control Using Generalized Advantage Estimation, arXiv:1506.02438, 2015;
@@ -66,7 +68,7 @@ class Settings:
     batches: int = 8  # of an epoch
     rate: float = 1e-3  # first learning rate
     clip: float = 0.2
-    discount: float = 0.99  # a decision
+    discount: float = 0.995  # a decision
     trace: float = 0.95  # lambda of the advantages
     entropy: float = 0.002
     value: float = 0.5  # weight of the value's loss
@@ -110,6 +112,7 @@ class Met(NamedTuple):
     """What a lane met: leaves (steps, …)."""
 
     seen: Array
+    told: Array  # to the critic alone: car, and what the judge keeps
     action: Array
     log_chance: Array
     value: Array
@@ -129,7 +132,7 @@ def layers(key: Array, sizes: tuple[int, ...], last: float) -> tuple[Layer, ...]
 
 
 def first_policy(key: Array, told: int) -> Policy:
-    """A policy that rolls on slowly, and tries much. `told`: numbers of a car."""
+    """A policy that rolls on slowly, and tries much. `told`: numbers that only the critic has."""
     a, c = jax.random.split(key)
     actor = layers(a, (FEATURES, *UNITS, 2), 0.01)
     rolls = Layer(actor[-1].weight, actor[-1].bias.at[0].set(CREEP))
@@ -137,9 +140,9 @@ def first_policy(key: Array, told: int) -> Policy:
     return Policy((*actor[:-1], rolls), layers(c, (FEATURES + told, *UNITS, 1), 1.0), scatter)
 
 
-def worth(policy: Policy, seen: Array, cars: Array) -> Array:
-    """The critic's values (…,) of observations and cars."""
-    return network(policy.critic, jnp.concatenate([seen, cars], axis=-1))[..., 0]
+def worth(policy: Policy, seen: Array, told: Array) -> Array:
+    """The critic's values (…,) of observations and what it alone is told."""
+    return network(policy.critic, jnp.concatenate([seen, told], axis=-1))[..., 0]
 
 
 def log_chance(mean: Array, log_scatter: Array, action: Array) -> Array:
@@ -164,12 +167,12 @@ def advantages(met: Met, last: Array, discount: float, trace: float) -> tuple[Ar
 
 def loss(settings: Settings, policy: Policy, batch: tuple[Array, ...]) -> Scalar:
     """PPO's loss of a batch of decisions."""
-    seen, cars, action, before, advantage, goal = batch
+    seen, told, action, before, advantage, goal = batch
     now = log_chance(network(policy.actor, seen), policy.log_scatter, action)
     ratio = jnp.exp(now - before)
     clipped = jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip)
     gain = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
-    value = worth(policy, seen, cars)
+    value = worth(policy, seen, told)
     entropy = jnp.sum(policy.log_scatter)
     return settings.value * jnp.mean((value - goal) ** 2) - gain - settings.entropy * entropy
 
@@ -217,9 +220,10 @@ class Trainer:
         """Before the first iteration; leaves of `own` have a leading axis of lanes."""
         root = jax.random.key(seed)
         first = jax.jit(first_policy, static_argnums=1)
-        policy = first(jax.random.fold_in(root, 0), self.cars.shape[1])
         keys = jax.random.split(jax.random.fold_in(root, 1), self.settings.lanes)
         lanes, _ = self._begin(own, keys, jnp.int32(0))
+        told = jax.eval_shape(self._told, lanes, self.cars)
+        policy = first(jax.random.fold_in(root, 0), told.shape[1])
         return self.placed(
             Training(
                 policy,
@@ -255,13 +259,16 @@ class Trainer:
             training.optimiser,
             met,
             last,
-            self.cars,
             training.iteration,
         )
         after = Training(
             policy, mean, optimiser, lanes, training.keys, training.iteration + np.int32(1)
         )
         return after, figures(jax.tree.map(lambda leaf: float(np.sum(leaf)), told), self.samples)
+
+    def _told(self, lanes: Lane, cars: Array) -> Array:
+        """What the critic alone is told (lanes, n)."""
+        return jnp.concatenate([cars, jax.vmap(self.environment.judged)(lanes)], axis=1)
 
     def _drive_block(
         self,
@@ -289,10 +296,12 @@ class Trainer:
             mean = network(policy.actor, seen)
             noise = drawn(2 * step, (2,), jax.random.normal)
             action = mean + jnp.exp(policy.log_scatter) * noise
-            value = worth(policy, seen, cars)
+            to_critic = self._told(lanes, cars)
+            value = worth(policy, seen, to_critic)
             lanes, _, terms, ended = jax.vmap(environment.step, (0, 0, None))(lanes, action, now)
             met = Met(
                 seen,
+                to_critic,
                 action,
                 log_chance(mean, policy.log_scatter, action),
                 value,
@@ -307,7 +316,7 @@ class Trainer:
 
         begin = (lanes, jax.vmap(environment.observe)(lanes))
         (lanes, seen), (met, told) = jax.lax.scan(one, begin, jnp.arange(settings.steps))
-        last = worth(policy, seen, cars)
+        last = worth(policy, seen, self._told(lanes, cars))
         # A limit of time is no end: the value of where the lane stands has been taken.
         end = tick + settings.steps * environment.ticks
         late = jnp.where(lanes.score.time > settings.longest, 1.0, 0.0)
@@ -328,7 +337,6 @@ class Trainer:
             state: Any,
             met: Met,
             last: Array,
-            cars: Array,
             iteration: Scalar,
         ) -> tuple[Policy, Policy, Any]:
             by_step = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), met)
@@ -337,7 +345,7 @@ class Trainer:
             wide = jnp.sqrt(jax.lax.pmean(jnp.mean((advantage - off) ** 2), "core")) + 1e-8
             columns = (
                 by_step.seen,
-                jnp.broadcast_to(cars, (settings.steps, *cars.shape)),
+                by_step.told,
                 by_step.action,
                 by_step.log_chance,
                 (advantage - off) / wide,
@@ -375,7 +383,7 @@ class Trainer:
             jax.shard_map(
                 on_core,
                 mesh=mesh,
-                in_specs=(same, same, same, cut, cut, cut, same),
+                in_specs=(same, same, same, cut, cut, same),
                 out_specs=same,
                 check_vma=False,
             )
