@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+
 from countersteer.runs.files import csv_text
 from countersteer.viewing.style import new_figure, styled
 from countersteer.writing import whole, write_whole
@@ -25,12 +27,17 @@ def save(
     label, size = unit
     done = [told[along] / size for told in curves]
     with styled(), whole(policy.with_suffix(".png")) as part:
-        figure, canvas = new_figure(9.0, 6.0)
+        figure, canvas = new_figure(10.0, 6.0)
         figure.set_layout_engine("constrained")
         for ax, names in zip(figure.subplots(2, 2).flat, panels, strict=True):
-            for name in names:
-                ax.plot(done, [told[name] for told in curves], label=name)
+            # Colours that come round again are told apart by dashes.
+            colours = len(matplotlib.rcParams["axes.prop_cycle"])
+            for i, name in enumerate(names):
+                dash = "-" if i < colours else "--"
+                ax.plot(done, [told[name] for told in curves], dash, label=name)
             ax.set_xlabel(label)
-            ax.legend(fontsize=7)
+            many = len(names) > 4  # they would hide the lines
+            place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)} if many else {}
+            ax.legend(fontsize=7, **place)
         figure.suptitle(title)
         canvas.print_png(str(part))
