@@ -2,8 +2,9 @@
 
     python -m benchmarks.environment [LANES] [ROUNDS]
 
-All sides drive the same random cars, with their floors and walls, in blocks on all cores: the bare
-physics with a held command; the functional environment with a held action, and with a policy of two
+All sides drive the same random cars, with their floors and walls, in blocks on all cores. What the
+cars have alike is one number for all (`engine.parted`), on every side. They are the bare physics
+with a held command; the functional environment with a held action, and with a policy of two
 layers of 64; and the Gymnasium vector environment, which goes through NumPy at each decision.
 Beside them, where they are installed: the car of `countersteer bench` in MuJoCo, on all cores, and
 the drift environment of Gym-Khana, one car in one process, as its users step it. Their steps are
@@ -54,18 +55,21 @@ def programs(lanes: int, cores: int) -> dict[str, tuple[int, Callable[[], Any]]]
     keys = jax.random.split(jax.random.key(0), lanes)
     begun = jax.jit(jax.vmap(Environment.reset, (None, 0, 0, None)))
     state, _ = begun(environment, own, keys, np.int32(0))
+    apart, once = engine.parted(own)
+    state = state._replace(own=apart)
     rng = np.random.default_rng(0)
     sizes = ((FEATURES, 64), (64, 64), (64, 2))
     layers = tuple(
         Layer(rng.normal(0, 0.1, s).astype(np.float32), np.zeros(s[1], np.float32)) for s in sizes
     )
 
-    def bare(lanes: Any, environment: Environment, layers: Any) -> Any:
+    def bare(lanes: Any, environment: Environment, once: Any, layers: Any) -> Any:
         del layers
         command = Command(jnp.float32(HELD[0]), environment.lock * jnp.float32(HELD[1]))
 
         def tick(state: Any, count: Any) -> tuple[Any, None]:
             def one(own: Any, state: Any) -> Any:
+                own = engine.joined(own, once)
                 return planar.step(own.car, environment.walls, state, command, count, DT, own.floor)
 
             return jax.vmap(one)(lanes.own, state), None
@@ -74,20 +78,22 @@ def programs(lanes: int, cores: int) -> dict[str, tuple[int, Callable[[], Any]]]
         return jax.lax.scan(tick, lanes.state, jnp.arange(ticks, dtype=jnp.int32))[0]
 
     def held(with_policy: bool) -> Any:
-        def run(lanes: Any, environment: Environment, layers: Any) -> Any:
+        def run(lanes: Any, environment: Environment, once: Any, layers: Any) -> Any:
+            def step(lane: Any, action: Any, even: Any, now: Any) -> Any:
+                whole = lane._replace(own=engine.joined(lane.own, once))
+                after, _, terms, ended = environment.step(whole, action, now)
+                after = environment.renewed(after, ended, even, now + environment.ticks)
+                return after._replace(own=lane.own), environment.observe(after), terms.total
+
             def one(carry: Any, number: Any) -> tuple[Any, Any]:
                 lanes, seen = carry
                 action = jnp.broadcast_to(jnp.asarray(HELD, jnp.float32), (seen.shape[0], 2))
                 if with_policy:
                     action = network(layers, seen)
                 now = number * environment.ticks
-                lanes, seen, terms, ended = jax.vmap(environment.step, (0, 0, None))(
-                    lanes, action, now
-                )
                 even = jnp.full((seen.shape[0], 5), 0.5, jnp.float32)
-                renewed = jax.vmap(environment.renewed, (0, 0, 0, None))
-                lanes = renewed(lanes, ended, even, now + environment.ticks)
-                return (lanes, seen), terms.total
+                lanes, seen, paid = jax.vmap(step, (0, 0, 0, None))(lanes, action, even, now)
+                return (lanes, seen), paid
 
             begin = (lanes, jax.vmap(environment.observe)(lanes))
             (lanes, _), paid = jax.lax.scan(one, begin, jnp.arange(DECISIONS, dtype=jnp.int32))
@@ -100,7 +106,7 @@ def programs(lanes: int, cores: int) -> dict[str, tuple[int, Callable[[], Any]]]
     sides = {"bare physics": bare, "environment": held(False), "environment, policy": held(True)}
     for name, run in sides.items():
         program = engine.in_one_program(run, cores=cores)
-        found[name] = ticks, functools.partial(program, state, environment, layers)
+        found[name] = ticks, functools.partial(program, state, environment, once, layers)
     many = DriftVectorEnv(lanes)
     many.reset(seed=0)
     actions = np.tile(np.asarray(HELD, np.float32), (lanes, 1))

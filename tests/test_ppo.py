@@ -180,6 +180,21 @@ def test_numbers_of_a_block_come_back_as_they_were():
     jax.tree.map(np.testing.assert_array_equal, engine.unpacking(block)(arrays), block)
 
 
+def test_what_is_alike_among_lanes_is_one_number_and_comes_back():
+    lanes = {
+        "alike": np.full(5, 2.5, np.float32),
+        "differs": np.arange(5.0),
+        "line": np.tile(np.arange(3), (5, 1)),
+    }
+    apart, once = engine.parted(lanes)
+    assert apart["alike"] is apart["line"] is once["differs"] is None
+    assert once["alike"] == np.float32(2.5)
+    for lane in range(5):
+        own = jax.tree.map(lambda leaf, at=lane: leaf[at], apart)
+        expected = jax.tree.map(lambda leaf, at=lane: leaf[at], lanes)
+        jax.tree.map(np.testing.assert_array_equal, engine.joined(own, once), expected)
+
+
 def test_no_two_decisions_draw_the_same_noise():
     trainer, state = tiny(1, longest=7.0, prize=0.0, wanted=0.0, ends_after=np.inf)
     noises = []

@@ -49,6 +49,11 @@ def shared_out(trees: Any, cores: int | None = None) -> Any:
     return jax.device_put(trees, NamedSharding(all_cores(cores), PartitionSpec("core")))
 
 
+def on_each(trees: Any, cores: int | None = None) -> Any:
+    """The same leaves, whole on each core."""
+    return jax.device_put(trees, NamedSharding(all_cores(cores), PartitionSpec()))
+
+
 def on_cores(run: Callable[..., Any], mesh: Mesh, lanes: Sequence[bool]) -> Callable[..., Any]:
     """`run` on each core, with the core's share of the arguments.
 
@@ -108,7 +113,9 @@ def in_one_program(
             return packed(run(unpack(numbers), *shared))
 
         after = jax.vmap(unpack_result)(jax.lax.map(block, jax.vmap(packed)(mine)))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), after)
+        return jax.tree.map(
+            lambda leaf: leaf.reshape(math.prod(leaf.shape[:2]), *leaf.shape[2:]), after
+        )
 
     return _compiled(on_core, cores)
 
@@ -134,6 +141,27 @@ def _compiled(on_core: Callable[..., Any], cores: int | None) -> Callable[..., A
         return on_cores(on_core, mesh, (True, *(False for _ in shared)))(own, *shared)
 
     return jax.jit(whole)
+
+
+def parted(trees: Any) -> tuple[Any, Any]:
+    """What differs among lanes, and what does not, as one lane has it; None in the other's place.
+
+    What is alike need not pass through memory for each lane. `joined` is the inverse for a lane.
+    """
+    leaves, form = jax.tree.flatten(trees)
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    alike = [bool(np.all(array == array[:1])) for array in arrays]
+    pairs = list(zip(leaves, arrays, alike, strict=True))
+    apart = [None if same else leaf for leaf, _, same in pairs]
+    once = [array[0] if same else None for _, array, same in pairs]
+    return jax.tree.unflatten(form, apart), jax.tree.unflatten(form, once)
+
+
+def joined(apart: Any, once: Any) -> Any:
+    """The whole of a lane, from the two trees of `parted`."""
+    return jax.tree.map(
+        lambda a, b: b if a is None else a, apart, once, is_leaf=lambda leaf: leaf is None
+    )
 
 
 def in_blocks(trees: Any, lanes: int) -> Any:

@@ -65,7 +65,8 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         block = min(engine.CACHED_LANES, max(1, num_envs // cores))
         # Whole blocks on each core: the lanes beyond the wanted ones are driven and not shown.
         self._lanes = engine.whole_blocks(num_envs, block, cores)
-        self._block, self._cores, self._slots = block, cores, -1
+        self._block, self._cores = block, cores
+        self._form: Any = None  # of what a step is compiled for
         self._reset = jax.jit(jax.vmap(Environment.reset, (None, 0, 0, None)))
         self._pack = jax.jit(jax.vmap(engine.packed))
 
@@ -88,16 +89,21 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self._tick = 0
         # What a car is stays; how it moves goes in and out of each step, in one piece.
         nothing: Any = ()
-        parts = [engine.in_blocks(part, self._block) for part in (own, state._replace(own=nothing))]
+        apart, once = engine.parted(own)
+        self._same = engine.on_each((self._environment, once), self._cores)
+        parts = [
+            engine.in_blocks(tree, self._block) for tree in (apart, state._replace(own=nothing))
+        ]
         blocks = (*map(self._pack, parts), engine.in_blocks(jax.random.key_data(keys), self._block))
         self._own, self._state, self._keys = engine.shared_out(blocks, self._cores)
-        if slots != self._slots:
+        form = slots, jax.tree.structure(apart)
+        if form != self._form:
             own_of, lane_of = (
                 engine.unpacking(jax.tree.map(lambda leaf: leaf[0], part)) for part in parts
             )
             stepped = functools.partial(_step, own_of, lane_of)
             self._step = engine.on_blocks(stepped, self._cores)
-            self._slots = slots
+            self._form = form
         self._done = np.zeros(self._lanes, np.float32)
         return np.asarray(seen)[: self.num_envs], {}
 
@@ -109,7 +115,7 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         full[: self.num_envs] = actions
         asked = engine.in_blocks((full, self._done), self._block)
         own = (self._own, self._state, self._keys, *asked)
-        self._state, told = self._step(own, self._environment, np.int32(self._tick))
+        self._state, told = self._step(own, *self._same, np.int32(self._tick))
         self._tick += self._environment.ticks
         told = np.asarray(told).reshape(self._lanes, -1)
         seen, terms, ended, time, outcome = np.split(told, PARTS, axis=1)
@@ -131,15 +137,18 @@ def _step(
     lane_of: Callable[[Any], Lane],
     block: tuple[Any, Any, Array, Array, Array],
     environment: Environment,
+    once: Own,
     tick: Scalar,
 ) -> tuple[Any, Array]:
     """A block's decision. Lanes that had ended begin a new episode instead.
 
-    Returns the packed lanes, and what is told of each (`PARTS`).
+    `once` is what all cars have alike. Returns the packed lanes, and what is told of each
+    (`PARTS`).
     """
-    apart: Any = ()  # what a car is does not change
+    none: Any = ()  # what a car is does not change
 
-    def one(lane: Lane, key: Array, action: Array, done: Scalar) -> tuple[Lane, Array]:
+    def one(own: Own, lane: Lane, key: Array, action: Array, done: Scalar) -> tuple[Lane, Array]:
+        lane = lane._replace(own=engine.joined(own, once))
         after, _, terms, ended = environment.step(lane, action, tick)
         own_key = jax.random.fold_in(jax.random.wrap_key_data(key), tick)
         fresh = jax.random.uniform(own_key, (5,), jnp.float32)
@@ -147,8 +156,8 @@ def _step(
         paid = (1 - done) * jnp.stack(terms)
         rest = jnp.stack([(1 - done) * ended, after.score.time, after.score.outcome])
         told = jnp.concatenate([environment.observe(after), paid, rest])
-        return after._replace(own=apart), told
+        return after._replace(own=none), told
 
     own, state, *others = block
-    lanes, told = jax.vmap(one)(lane_of(state)._replace(own=own_of(own)), *others)
+    lanes, told = jax.vmap(one)(own_of(own), lane_of(state), *others)
     return engine.packed(lanes), told

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import PartitionSpec
 
 from countersteer.batch import engine, evaluate
 from countersteer.batch.population import Population
@@ -240,7 +240,7 @@ class Trainer:
         lanes, keys = engine.shared_out((training.lanes, training.keys), self.mesh.size)
         apart: Any = None
         rest = training._replace(lanes=apart, keys=apart)
-        same = jax.device_put(rest, NamedSharding(self.mesh, PartitionSpec()))
+        same: Training = engine.on_each(rest, self.mesh.size)
         return same._replace(lanes=lanes, keys=keys)
 
     def iterate(self, training: Training) -> tuple[Training, dict[str, float]]:
