@@ -3,7 +3,7 @@
     python -m benchmarks.environment [LANES] [ROUNDS]
 
 All sides drive the same random cars, with their floors and walls, in blocks on all cores. What the
-cars have alike is one number for all (`engine.parted`), on every side. They are the bare physics
+cars have alike is one number for all (`engine.parted`), on every side. The sides are: bare physics
 with a held command; the functional environment with a held action, and with a policy of two
 layers of 64; and the Gymnasium vector environment, which goes through NumPy at each decision.
 Beside them, where they are installed: the car of `countersteer bench` in MuJoCo, on all cores, and

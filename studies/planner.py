@@ -39,11 +39,15 @@ DRIFT = 25.0  # degrees of sideslip, from which a turn is a drift
 
 
 def bends_of(course: Course) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """The points of the rounded line (n, 2), and the first and last row of each bend."""
+    """The points of the rounded line (n, 2), and the first and last row of each bend.
+
+    There are none where the judge finds turns.
+    """
     way = way_of(course)
     rows = int(way.last) + 1
     edges = np.flatnonzero(np.diff(way.bend[:rows], prepend=0.0, append=0.0))
-    bends = [(int(a), int(b)) for a, b in itertools.pairwise(edges) if way.bend[a] != 0]
+    pairs = [] if course.turns else itertools.pairwise(edges)
+    bends = [(int(a), int(b)) for a, b in pairs if way.bend[a] != 0]
     return np.stack([way.x, way.y], axis=1)[:rows], bends
 
 
@@ -55,8 +59,6 @@ def drives(name: str, seeds: range) -> list[dict[str, Any]]:
     pilot = Pilot.of(Mppi(course, car), course, car, "truth")
     task = Task.of(course, 1, walls_end=True)
     points, bends = bends_of(course)
-    if task.corners.angle.size:
-        bends = []
     line = KDTree(points)
     found = []
     for i, seed in enumerate(seeds):
@@ -116,9 +118,8 @@ def main(name: str, cars: int = CARS, first: int = FIRST) -> int:
     if len(over):
         print(f"  overshoot {np.median(over):.0f}°, 95th percentile {np.percentile(over, 95):.0f}°")
     course = load_course(name)
-    places = [f"bend of {SPACING * a:.1f} to {SPACING * b:.1f} m" for a, b in bends_of(course)[1]]
-    if len(over):
-        places = [f"turn at {turn.distance:.1f} m" for turn in course.turns_ahead(1)]
+    places = [f"turn at {turn.distance:.1f} m" for turn in course.turns_ahead(1)]
+    places += [f"bend of {SPACING * a:.1f} to {SPACING * b:.1f} m" for a, b in bends_of(course)[1]]
     slips = np.array([one["sideslip"] for one in round_])
     for place, slip in zip(places, slips.T, strict=True):
         print(

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
 from countersteer.runs.files import csv_text
 from countersteer.viewing.style import new_figure, styled
 from countersteer.writing import whole, write_whole
@@ -30,11 +28,12 @@ def save(
         figure, canvas = new_figure(10.0, 6.0)
         figure.set_layout_engine("constrained")
         for ax, names in zip(figure.subplots(2, 2).flat, panels, strict=True):
-            # Colours that come round again are told apart by dashes.
-            colours = len(matplotlib.rcParams["axes.prop_cycle"])
-            for i, name in enumerate(names):
-                dash = "-" if i < colours else "--"
-                ax.plot(done, [told[name] for told in curves], dash, label=name)
+            drawn: set[Any] = set()
+            for name in names:
+                (line,) = ax.plot(done, [told[name] for told in curves], label=name)
+                # Colours that come round again are told apart by dashes.
+                line.set_linestyle("--" if line.get_color() in drawn else "-")
+                drawn.add(line.get_color())
             ax.set_xlabel(label)
             many = len(names) > 4  # they would hide the lines
             place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)} if many else {}

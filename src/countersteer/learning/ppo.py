@@ -112,7 +112,7 @@ class Met(NamedTuple):
     """What a lane met: leaves (steps, …)."""
 
     seen: Array
-    told: Array  # to the critic alone: car, and what the judge keeps
+    privileged: Array  # what the critic alone is told: the car, and what the judge keeps
     action: Array
     log_chance: Array
     value: Array
@@ -131,18 +131,18 @@ def layers(key: Array, sizes: tuple[int, ...], last: float) -> tuple[Layer, ...]
     return tuple(found)
 
 
-def first_policy(key: Array, told: int) -> Policy:
-    """A policy that rolls on slowly, and tries much. `told`: numbers that only the critic has."""
+def first_policy(key: Array, privileged: int) -> Policy:
+    """A policy that rolls on slowly, and tries much. `privileged`: the critic's own inputs."""
     a, c = jax.random.split(key)
     actor = layers(a, (FEATURES, *UNITS, 2), 0.01)
     rolls = Layer(actor[-1].weight, actor[-1].bias.at[0].set(CREEP))
     scatter = jnp.full(2, math.log(BEGIN_SCATTER), jnp.float32)
-    return Policy((*actor[:-1], rolls), layers(c, (FEATURES + told, *UNITS, 1), 1.0), scatter)
+    return Policy((*actor[:-1], rolls), layers(c, (FEATURES + privileged, *UNITS, 1), 1.0), scatter)
 
 
-def worth(policy: Policy, seen: Array, told: Array) -> Array:
+def worth(policy: Policy, seen: Array, privileged: Array) -> Array:
     """The critic's values (…,) of observations and what it alone is told."""
-    return network(policy.critic, jnp.concatenate([seen, told], axis=-1))[..., 0]
+    return network(policy.critic, jnp.concatenate([seen, privileged], axis=-1))[..., 0]
 
 
 def log_chance(mean: Array, log_scatter: Array, action: Array) -> Array:
@@ -167,12 +167,12 @@ def advantages(met: Met, last: Array, discount: float, trace: float) -> tuple[Ar
 
 def loss(settings: Settings, policy: Policy, batch: tuple[Array, ...]) -> Scalar:
     """PPO's loss of a batch of decisions."""
-    seen, told, action, before, advantage, goal = batch
+    seen, privileged, action, before, advantage, goal = batch
     now = log_chance(network(policy.actor, seen), policy.log_scatter, action)
     ratio = jnp.exp(now - before)
     clipped = jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip)
     gain = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
-    value = worth(policy, seen, told)
+    value = worth(policy, seen, privileged)
     entropy = jnp.sum(policy.log_scatter)
     return settings.value * jnp.mean((value - goal) ** 2) - gain - settings.entropy * entropy
 
@@ -222,8 +222,8 @@ class Trainer:
         first = jax.jit(first_policy, static_argnums=1)
         keys = jax.random.split(jax.random.fold_in(root, 1), self.settings.lanes)
         lanes, _ = self._begin(own, keys, jnp.int32(0))
-        told = jax.eval_shape(self._told, lanes, self.cars)
-        policy = first(jax.random.fold_in(root, 0), told.shape[1])
+        privileged = jax.eval_shape(self._privileged, lanes, self.cars)
+        policy = first(jax.random.fold_in(root, 0), privileged.shape[1])
         return self.placed(
             Training(
                 policy,
@@ -266,7 +266,7 @@ class Trainer:
         )
         return after, figures(jax.tree.map(lambda leaf: float(np.sum(leaf)), told), self.samples)
 
-    def _told(self, lanes: Lane, cars: Array) -> Array:
+    def _privileged(self, lanes: Lane, cars: Array) -> Array:
         """What the critic alone is told (lanes, n)."""
         return jnp.concatenate([cars, jax.vmap(self.environment.judged)(lanes)], axis=1)
 
@@ -296,12 +296,12 @@ class Trainer:
             mean = network(policy.actor, seen)
             noise = drawn(2 * step, (2,), jax.random.normal)
             action = mean + jnp.exp(policy.log_scatter) * noise
-            to_critic = self._told(lanes, cars)
-            value = worth(policy, seen, to_critic)
+            privileged = self._privileged(lanes, cars)
+            value = worth(policy, seen, privileged)
             lanes, _, terms, ended = jax.vmap(environment.step, (0, 0, None))(lanes, action, now)
             met = Met(
                 seen,
-                to_critic,
+                privileged,
                 action,
                 log_chance(mean, policy.log_scatter, action),
                 value,
@@ -316,7 +316,7 @@ class Trainer:
 
         begin = (lanes, jax.vmap(environment.observe)(lanes))
         (lanes, seen), (met, told) = jax.lax.scan(one, begin, jnp.arange(settings.steps))
-        last = worth(policy, seen, self._told(lanes, cars))
+        last = worth(policy, seen, self._privileged(lanes, cars))
         # A limit of time is no end: the value of where the lane stands has been taken.
         end = tick + settings.steps * environment.ticks
         late = jnp.where(lanes.score.time > settings.longest, 1.0, 0.0)
@@ -345,7 +345,7 @@ class Trainer:
             wide = jnp.sqrt(jax.lax.pmean(jnp.mean((advantage - off) ** 2), "core")) + 1e-8
             columns = (
                 by_step.seen,
-                by_step.told,
+                by_step.privileged,
                 by_step.action,
                 by_step.log_chance,
                 (advantage - off) / wide,
