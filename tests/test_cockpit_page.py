@@ -150,6 +150,22 @@ def page(driving: Any) -> Any:
     return driving
 
 
+@pytest.fixture
+def earlier(page: Any, folder: Path) -> set[str]:
+    """The runs that were recorded before the test."""
+    assert page.evaluate(phase_is("ready"))  # what drove before is complete
+    return {path.parent.name for path in folder.glob("runs/*/run.toml")}
+
+
+def finished_run(page: Any, earlier: set[str]) -> str:
+    """End the drive, and give the run's name as soon as the page lists it."""
+    page.keyboard.press("r")
+    page.click("#tab-runs")
+    newest = "document.querySelector('#run-list [data-run]')?.dataset.run"
+    until(page, f"!{['', *earlier]}.includes({newest} ?? '')")
+    return str(page.evaluate(newest))
+
+
 class Keys:
     """The keys that a player holds; each change is a real event."""
 
@@ -193,7 +209,9 @@ def drift(page: Any, before: float, lead: float, left: float, fastest: float) ->
     return {}
 
 
-def test_a_player_drifts_round_a_corner_and_keeps_a_run_that_is_marked_and_replayed(page, folder):
+def test_a_player_drifts_round_a_corner_and_keeps_a_run_that_is_marked_and_replayed(
+    page, folder, earlier
+):
     page.select_option("#course", "box")
     until(page, "document.getElementById('stage').dataset.course === 'box'")
     until(page, phase_is("ready"))
@@ -208,10 +226,7 @@ def test_a_player_drifts_round_a_corner_and_keeps_a_run_that_is_marked_and_repla
         pytest.fail(f"no drift in {ATTEMPTS} attempts")
     assert "drift" in page.locator("#banner").inner_text()
     until(page, "Number(document.getElementById('stage').dataset.time) > 2.2")
-    page.keyboard.press("r")  # the drive is broken off, and its record is complete
-    page.click("#tab-runs")
-    until(page, "document.querySelector('#run-list [data-run] small')")
-    name = page.locator("#run-list [data-run]").first.get_attribute("data-run")
+    name = finished_run(page, earlier)  # the drive is broken off, and its record is complete
     page.keyboard.press("m")
     until(page, f"document.querySelector('[data-run=\"{name}\"]').dataset.mark === 'good'")
     run = read_run(folder / "runs" / name)
@@ -425,7 +440,7 @@ def steps(served: Cockpit, monkeypatch: pytest.MonkeyPatch) -> list[tuple[float,
 
 
 def test_silence_of_the_page_cuts_the_throttle_within_200_ms_and_so_does_its_end(
-    opened, page, steps, folder
+    opened, page, steps, folder, earlier
 ):
     watcher = opened()
     page.keyboard.down("ArrowUp")
@@ -437,10 +452,7 @@ def test_silence_of_the_page_cuts_the_throttle_within_200_ms_and_so_does_its_end
     cut = "document.getElementById('events').textContent.includes('throttle cut')"
     until(watcher, f"{TIME} > {closed} + 0.5 && {THROTTLE} === 0 && {cut}")
     until(watcher, role_is("drives"))
-    watcher.keyboard.press("r")
-    watcher.click("#tab-runs")
-    until(watcher, "document.querySelector('#run-list [data-run] small')")
-    name = watcher.locator("#run-list [data-run]").first.get_attribute("data-run")
+    name = finished_run(watcher, earlier)
     watcher.close()
     since, times = np.array(steps).T
 
