@@ -90,18 +90,18 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         # What a car is stays; how it moves goes in and out of each step, in one piece.
         nothing: Any = ()
         apart, once = engine.parted(own)
-        self._same = engine.on_each((self._environment, once), self._cores)
+        same = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (self._environment, once))
+        self._same = engine.on_each(engine.packed(same), self._cores)
         parts = [
             engine.in_blocks(tree, self._block) for tree in (apart, state._replace(own=nothing))
         ]
-        blocks = (*map(self._pack, parts), engine.in_blocks(jax.random.key_data(keys), self._block))
-        self._own, self._state, self._keys = engine.shared_out(blocks, self._cores)
+        self._own, self._state = engine.shared_out(tuple(map(self._pack, parts)), self._cores)
         form = slots, jax.tree.structure(apart)
         if form != self._form:
             own_of, lane_of = (
                 engine.unpacking(jax.tree.map(lambda leaf: leaf[0], part)) for part in parts
             )
-            stepped = functools.partial(_step, own_of, lane_of)
+            stepped = functools.partial(_step, own_of, lane_of, engine.unpacking(same))
             self._step = engine.on_blocks(stepped, self._cores)
             self._form = form
         self._done = np.zeros(self._lanes, np.float32)
@@ -114,8 +114,8 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         full = np.zeros((self._lanes, 2), np.float32)
         full[: self.num_envs] = actions
         asked = engine.in_blocks((full, self._done), self._block)
-        own = (self._own, self._state, self._keys, *asked)
-        self._state, told = self._step(own, *self._same, np.int32(self._tick))
+        own = (self._own, self._state, *asked)
+        self._state, told = self._step(own, self._same, np.int32(self._tick))
         self._tick += self._environment.ticks
         told = np.asarray(told).reshape(self._lanes, -1)
         seen, terms, ended, time, outcome = np.split(told, PARTS, axis=1)
@@ -135,24 +135,23 @@ PARTS = np.cumsum([FEATURES, len(Reward._fields), 1, 1])
 def _step(
     own_of: Callable[[Any], Own],
     lane_of: Callable[[Any], Lane],
-    block: tuple[Any, Any, Array, Array, Array],
-    environment: Environment,
-    once: Own,
+    same_of: Callable[[Any], tuple[Environment, Own]],
+    block: tuple[Any, Any, Array, Array],
+    same: Any,
     tick: Scalar,
 ) -> tuple[Any, Array]:
     """A block's decision. Lanes that had ended begin a new episode instead.
 
-    `once` is what all cars have alike. Returns the packed lanes, and what is told of each
+    `same` is the environment, and what all cars have alike. Returns the packed lanes, and what is told of each
     (`PARTS`).
     """
     none: Any = ()  # what a car is does not change
+    environment, once = jax.tree.map(lambda leaf: leaf[0], same_of(same))
 
-    def one(own: Own, lane: Lane, key: Array, action: Array, done: Scalar) -> tuple[Lane, Array]:
+    def one(own: Own, lane: Lane, action: Array, done: Scalar) -> tuple[Lane, Array]:
         lane = lane._replace(own=engine.joined(own, once))
         after, _, terms, ended = environment.step(lane, action, tick)
-        own_key = jax.random.fold_in(jax.random.wrap_key_data(key), tick)
-        fresh = jax.random.uniform(own_key, (5,), jnp.float32)
-        after = environment.renewed(after, done, fresh, tick + environment.ticks)
+        after = environment.renewed(after, done, jnp.zeros(5), tick + environment.ticks)
         paid = (1 - done) * jnp.stack(terms)
         rest = jnp.stack([(1 - done) * ended, after.score.time, after.score.outcome])
         told = jnp.concatenate([environment.observe(after), paid, rest])

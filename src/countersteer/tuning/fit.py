@@ -167,6 +167,7 @@ class Stage(NamedTuple):
 
     parameters: tuple[str, ...]
     chooses: Callable[[Shots], np.ndarray]  # mask of the windows that excite them
+    needs: str  # what such a window is
 
 
 def straight(shots: Shots) -> np.ndarray:
@@ -210,12 +211,13 @@ def any_window(shots: Shots) -> np.ndarray:
     return np.full(len(shots.surface), True)
 
 
+STEERED = "steered by 4° or more, without sliding"
 STAGES = {
-    "longitudinal": Stage(SPEEDS, straight),
-    "steering": Stage(STEERING, steered),
-    "handling": Stage((*HANDLING, *TIRES[:4]), steered),
-    "drift": Stage((*HANDLING, *TIRES), slides),
-    "all": Stage(PARAMETERS, any_window),
+    "longitudinal": Stage(SPEEDS, straight, "steered by less than 4°"),
+    "steering": Stage(STEERING, steered, STEERED),
+    "handling": Stage((*HANDLING, *TIRES[:4]), steered, STEERED),
+    "drift": Stage((*HANDLING, *TIRES), slides, "sideslip above 10°, or wheelspin"),
+    "all": Stage(PARAMETERS, any_window, ""),
 }
 ORDER = ("longitudinal", "steering", "handling", "drift", "all")
 
@@ -661,13 +663,14 @@ def fit(
             free = (*free, CHARGE)
         chosen = stage.chooses(shots)
         if not chosen.any() and name == what:
-            raise InputError(f"--fit {what}: no window of these runs tells of it")
+            raise InputError(f"--fit {what}: no window of these runs tells of it ({stage.needs})")
         if not chosen.any():
             report(f"{name}: no window tells of it")
             continue
         part = select(shots, chosen)
         if name == what:
-            report(f"{what}: {int(chosen.sum())} windows")
+            only = f" of {len(chosen)}: {stage.needs}" if stage.needs else ""
+            report(f"{what}: {int(chosen.sum())} windows{only}")
             break
         problem = Problem(current, part, free, cars, charge)
         solved = problem.solve(problem.start, PASSES)

@@ -187,10 +187,10 @@ def tune(
     return result, about, parts
 
 
-def spread(run: np.ndarray) -> np.ndarray:
-    """The indices of `MOST` windows or less, evenly among those of each log (windows,)."""
+def spread(run: np.ndarray, most: int = MOST) -> np.ndarray:
+    """The indices of `most` windows or less, evenly among those of each log (windows,)."""
     of_log = [np.flatnonzero(run == number) for number in np.unique(run)]
-    share = max(MOST // len(of_log), 1)
+    share = max(most // len(of_log), 1)
     even = [np.unique(np.linspace(0, len(k) - 1, min(share, len(k))).astype(int)) for k in of_log]
     return np.sort(np.concatenate([k[i] for k, i in zip(of_log, even, strict=True)]))
 
