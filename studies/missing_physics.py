@@ -29,7 +29,7 @@ from scipy.cluster.vq import kmeans2
 
 from countersteer.car.car import Car
 from countersteer.car.files import load_car
-from countersteer.car.parameter import parameter, pytree
+from countersteer.car.parameter import changed, parameter, pytree
 from countersteer.compiling import configure_jax
 from countersteer.runs.run import read_run
 from countersteer.signals import Motion, Scalar, Wheels
@@ -38,7 +38,7 @@ from countersteer.tuning.shooting import BEFORE, SAMPLE, Shots
 from countersteer.world import chassis, planar
 from countersteer.world.planar import State
 
-WINDOWS = 240  # of a fit
+WINDOWS = tune.MOST
 CENTRES = 8
 ACCELERATIONS = ("forward", "left", "yaw")
 REACH = np.array([0.7, 0.4, 1.5, 0.15, 0.3])  # widths of a Gaussian: m/s, m/s, rad/s, rad, 1
@@ -58,6 +58,7 @@ VARIANTS = {
     "load sensitivity": LOADS,
     "steering compliance": COMPLIANCE,
     "residual": RESIDUAL,
+    "residual, none forward": tuple(path for path in RESIDUAL if ".forward_" not in path),
 }
 
 
@@ -179,6 +180,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     reads.add_argument("prior")
     reads.add_argument("runs", nargs="+")
     reads.add_argument("--validate", nargs="+", required=True)
+    reads.add_argument("--windows", type=int, default=WINDOWS, help="of a fit, at most")
+    reads.add_argument("--laws", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     asked = reads.parse_args(arguments)
     configure_jax(blocks=True)
     with jax.enable_x64(True):
@@ -189,23 +192,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         base = Path(asked.fitted).stem
         found, prior = cars_of(asked.fitted, named), cars_of(asked.prior, named)
         logs = tune.read_logs(runs, found, tune.EVERY, base)
-        thin = logs.where(tune.spread(logs.run, WINDOWS))
+        thin = logs.where(tune.spread(logs.run, asked.windows))
         unseen = tune.read_logs(others, found, tune.EVERY, base)
         put_on_trial(centres_of(thin.shots))
+        # As in `fit.fit`: what slow driving tells of the steering is not searched for.
+        told = [one.path for one in fit.told(thin.shots, found[base])]
+        for path in told:
+            value = np.float64(fit.value_of(found[base], path))
+            prior = {floor: changed(car, path, value) for floor, car in prior.items()}
         charge = fit.estimated_charge(found, thin.shots)
-        for name, more in VARIANTS.items():
-            free = (*fit.PARAMETERS, *more, fit.CHARGE)
+        for name in asked.laws:
+            more: tuple[str, ...] = VARIANTS[name]
+            free = [p for p in (*fit.PARAMETERS, *more, fit.CHARGE) if p not in told]
             problem = fit.Problem(prior, thin.shots, free)
             begin = fit.Problem(found, thin.shots, free, None, charge).start
             solved = problem.solve(begin, fit.PASSES)
             cars = problem.cars_at(solved.x)
             values = problem.outside(solved.x)
-            told = {
+            numbers = {
                 p.path: round(float(v), 3)
                 for p, v in zip(problem.parameters, values, strict=True)
                 if p.path in more
             }
-            print(name, f"cost {solved.cost:.2f}", told, flush=True)
+            print(name, f"cost {solved.cost:.2f}", numbers, flush=True)
             known = unseen.with_charge(fit.estimated_charge(cars, unseen.shots))
             for i, run in enumerate(others):
                 chosen = known.run == i

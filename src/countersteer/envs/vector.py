@@ -142,8 +142,8 @@ def _step(
 ) -> tuple[Any, Array]:
     """A block's decision. Lanes that had ended begin a new episode instead.
 
-    `same` is the environment, and what all cars have alike. Returns the packed lanes, and what is told of each
-    (`PARTS`).
+    `same` is the environment, and what all cars have alike. Returns the packed lanes, and what is
+    told of each (`PARTS`).
     """
     none: Any = ()  # what a car is does not change
     environment, once = jax.tree.map(lambda leaf: leaf[0], same_of(same))
