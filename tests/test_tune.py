@@ -382,6 +382,13 @@ def test_errors_are_pooled_by_log(logs, windows):
     assert "– where something changes" in page
 
 
+def test_a_stage_without_windows_says_what_it_needs(logs, windows):
+    _, cars = logs
+    turning = fit.select(windows.shots, ~fit.straight(windows.shots))
+    with pytest.raises(InputError, match=r"longitudinal.*less than 4°"):
+        fit.fit(cars, turning, "longitudinal")
+
+
 def test_no_window_is_one_line(tmp_path, capsys):
     commands = tmp_path / "commands.csv"
     time = np.arange(0, 1, 0.05)

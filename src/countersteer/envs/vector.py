@@ -111,10 +111,9 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One decision of 20 ms of all cars; `infos` has the reward's terms and the outcomes."""
-        full = np.zeros((self._lanes, 2), np.float32)
-        full[: self.num_envs] = actions
-        asked = engine.in_blocks((full, self._done), self._block)
-        own = (self._own, self._state, *asked)
+        asked = np.zeros((self._lanes, 3), np.float32)
+        asked[: self.num_envs, :2], asked[:, 2] = actions, self._done
+        own = (self._own, self._state, engine.in_blocks(asked, self._block))
         self._state, told = self._step(own, self._same, np.int32(self._tick))
         self._tick += self._environment.ticks
         told = np.asarray(told).reshape(self._lanes, -1)
@@ -136,27 +135,28 @@ def _step(
     own_of: Callable[[Any], Own],
     lane_of: Callable[[Any], Lane],
     same_of: Callable[[Any], tuple[Environment, Own]],
-    block: tuple[Any, Any, Array, Array],
+    block: tuple[Any, Any, Array],
     same: Any,
     tick: Scalar,
 ) -> tuple[Any, Array]:
     """A block's decision. Lanes that had ended begin a new episode instead.
 
-    `same` is the environment, and what all cars have alike. Returns the packed lanes, and what is
-    told of each (`PARTS`).
+    A lane is asked for its action, and has a 1 behind it if it had ended. `same` is the
+    environment, and what all cars have alike. Returns the packed lanes, and what is told of each
+    (`PARTS`).
     """
     none: Any = ()  # what a car is does not change
     environment, once = jax.tree.map(lambda leaf: leaf[0], same_of(same))
 
-    def one(own: Own, lane: Lane, action: Array, done: Scalar) -> tuple[Lane, Array]:
-        lane = lane._replace(own=engine.joined(own, once))
-        after, _, terms, ended = environment.step(lane, action, tick)
+    def one(own: Own, lane: Lane, asked: Array) -> tuple[Lane, Array]:
+        lane, done = lane._replace(own=engine.joined(own, once)), asked[2]
+        after, _, terms, ended = environment.step(lane, asked[:2], tick)
         after = environment.renewed(after, done, jnp.zeros(5), tick + environment.ticks)
         paid = (1 - done) * jnp.stack(terms)
         rest = jnp.stack([(1 - done) * ended, after.score.time, after.score.outcome])
         told = jnp.concatenate([environment.observe(after), paid, rest])
         return after._replace(own=none), told
 
-    own, state, *others = block
-    lanes, told = jax.vmap(one)(own_of(own), lane_of(state), *others)
+    own, state, asked = block
+    lanes, told = jax.vmap(one)(own_of(own), lane_of(state), asked)
     return engine.packed(lanes), told
