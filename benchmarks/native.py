@@ -18,7 +18,7 @@ WIDTH = 16  # lanes of a vector
 COMPILE = ("cc", "-O3", "-march=native", "-ffast-math", "-fPIC", "-c")
 # Linked separately: with -ffast-math, a library makes the whole process flush denormals.
 LINK = ("cc", "-shared")
-COMPILE_TIME = 600  # s, limit: it takes 30, and far longer on a busy machine
+COMPILE_TIME = 600  # s: a guard against a compiler that hangs, also on a busy machine
 
 PRELUDE = """
 #include <math.h>

@@ -6,9 +6,8 @@ FITTED is what `tune` made of RUN… from PRIOR (cars of other floors are beside
 adds a law to the car's physics. The search goes on from FITTED with the law's numbers free beside
 all that `tune` fits. Numbers of 0 leave the physics as it is; their priors are 0 ± `WIDTHS`.
 
-- load sensitivity: friction times (load / load at rest)^-s, for each axle. A cornering tyre's
-  friction falls with its load, by s of 0.05 to 0.2 on cars (H. B. Pacejka, Tire and Vehicle
-  Dynamics, chapter 4).
+- load sensitivity: friction times (load / load at rest)^-s, for each axle. The friction of rubber
+  falls as the load rises: s is positive.
 - steering compliance: the front wheels give way by c times the lateral acceleration.
 - residual: accelerations forward, left and of yaw from `CENTRES` Gaussians over what drives the
   motion: vx, vy, yaw rate, steering, duty. A mirrored motion has mirrored accelerations. Away from

@@ -151,7 +151,9 @@ def _step(
     def one(own: Own, lane: Lane, asked: Array) -> tuple[Lane, Array]:
         lane, done = lane._replace(own=engine.joined(own, once)), asked[2]
         after, _, terms, ended = environment.step(lane, asked[:2], tick)
-        after = environment.renewed(after, done, jnp.zeros(5), tick + environment.ticks)
+        # All begin at the start (`Environment.rolling` is 0): no random numbers are needed.
+        even = jnp.zeros(5, jnp.float32)
+        after = environment.renewed(after, done, even, tick + environment.ticks)
         paid = (1 - done) * jnp.stack(terms)
         rest = jnp.stack([(1 - done) * ended, after.score.time, after.score.outcome])
         told = jnp.concatenate([environment.observe(after), paid, rest])

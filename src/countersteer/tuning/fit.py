@@ -211,12 +211,13 @@ def any_window(shots: Shots) -> np.ndarray:
     return np.full(len(shots.surface), True)
 
 
-STEERED = "steered by 4° or more, without sliding"
+_STRAIGHT, _SLIDES = (f"{math.degrees(angle):.0f}°" for angle in (STRAIGHT, SLIDES))
+STEERED = f"steered by {_STRAIGHT} or more, without sliding"
 STAGES = {
-    "longitudinal": Stage(SPEEDS, straight, "steered by less than 4°"),
+    "longitudinal": Stage(SPEEDS, straight, f"steered by less than {_STRAIGHT}"),
     "steering": Stage(STEERING, steered, STEERED),
     "handling": Stage((*HANDLING, *TIRES[:4]), steered, STEERED),
-    "drift": Stage((*HANDLING, *TIRES), slides, "sideslip above 10°, or wheelspin"),
+    "drift": Stage((*HANDLING, *TIRES), slides, f"sideslip above {_SLIDES}, or wheelspin"),
     "all": Stage(PARAMETERS, any_window, ""),
 }
 ORDER = ("longitudinal", "steering", "handling", "drift", "all")
