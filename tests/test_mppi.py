@@ -109,6 +109,10 @@ def test_each_term_of_the_cost_counts_what_it_says() -> None:
     turning = slow._replace(vy=-0.3 + slow.vy)
     assert cost(slow, sideslip=1, straight=1) == 0 < cost(turning, sideslip=1, straight=1)
     assert cost(slow, jerky, smoothness=1) == pytest.approx(KNOTS - 1)
+    assert cost(fast, standing=1) == 0
+    assert cost(straight_on(x, 0, 0.1), standing=1) == pytest.approx(1 - 0.2 / mppi.SLOW, abs=1e-3)
+    assert cost(straight_on(x + 0.6, 0, -0.5), sideslip=1, straight=1) == 0  # it backs off
+    assert cost(straight_on(x + 1, 0, -1.5), sideslip=1, straight=1) > 1  # after a spin
 
 
 def test_commands_are_drawn_around_the_plan_within_their_limits() -> None:
@@ -156,6 +160,17 @@ def test_it_laps_the_box_in_a_drift() -> None:
     assert score.wall_contacts == 0
     assert score.goal_time < 5.0
     assert np.sum(score.turns.peak_sideslip > math.radians(25)) >= 2
+
+
+def test_a_car_with_its_nose_to_a_wall_backs_off() -> None:
+    course = load_course("box")
+    front = float(CAR.body.center + CAR.body.length / 2)
+    start = (1.5, 0.7 - 0.04 - front, math.pi / 2)  # 4 cm from the left wall of the first straight
+    pilot = Pilot.of(Mppi(course, CAR), course, CAR, "truth")
+    record = Simulator.of(course, CAR, start=start).record(pilot, 3.0)
+    assert np.min(record.motion.vx) < -0.1
+    assert np.hypot(record.motion.x[-1] - start[0], record.motion.y[-1] - start[1]) > 1.5
+    assert np.max(record.wall_contacts) == 0
 
 
 def test_changes_of_a_plan_stay_within_its_limits_and_the_first_is_the_plan() -> None:

@@ -54,7 +54,8 @@ class Costs(NamedTuple):
     overshoot: float = 6.0  # of the square of the heading beyond the corner's way out, rad²
     smoothness: float = 0.05  # of the square of the change of a command, in full commands, a knot
     backwards: float = 10.0  # of facing against the line; the sideslip does not count there
-    margin: float = 0.08  # m
+    standing: float = 2.0  # before the goal: of the part by which the speed is under `SLOW`
+    margin: float = 0.15  # m
     drift: float = math.radians(30)  # what the sideslip should be in corners
 
 
@@ -100,6 +101,8 @@ class Rollouts(NamedTuple):
 
 MOST_SLIP = 9.0  # of that square
 ASTRAY = 0.2  # cosine of the heading off the line, under which a car faces backwards
+SLOW = 0.5  # m/s; a slower car stands
+BACKING = 1.0  # m/s
 HISTORY = 16  # knots; a longer pure delay is cut off
 # Throttle, and steering as a part of the lock.
 HELD = tuple((throttle, side) for throttle in (-1.0, -0.5, 0.5, 1.0) for side in (-1.0, 0.0, 1.0))
@@ -148,8 +151,10 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
 
     bend = way.bend[row]
     speed = jnp.sqrt(motion.vx**2 + motion.vy**2) + 0.1
+    # A slow car that goes backwards backs off: that is no spin.
+    forward = jnp.where(speed < BACKING, jnp.abs(motion.vx), motion.vx)
     # Nose in, by `drift`, in a corner; straight elsewhere.
-    off = (jnp.arctan2(motion.vy, motion.vx) + bend * costs.drift) / costs.drift
+    off = (jnp.arctan2(motion.vy, forward) + bend * costs.drift) / costs.drift
     weight = jnp.where(bend == 0, costs.straight, 1.0) * jnp.minimum(speed, 1.0)
     # Too much is a spin to come: it counts more than too little.
     much = jnp.where(bend * off < 0, costs.excess, 1.0)
@@ -161,6 +166,8 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
     beyond = jnp.arctan2(out_x * sine - out_y * cosine, out_x * cosine + out_y * sine)
     over = jnp.maximum(bend * beyond, 0.0) ** 2
     against = jnp.maximum(ASTRAY - facing, 0.0)
+    # Nose to a wall, a car has to back off. That loses way for longer than the horizon.
+    stands = jnp.maximum(1.0 - speed / SLOW, 0.0)
     changes = jnp.diff(commands.throttle) ** 2 + (jnp.diff(commands.steering) / problem.lock) ** 2
     arrived = jnp.where(places > problem.goal, 1.0, 0.0)
     left = jnp.minimum(end, problem.goal) - jnp.minimum(place, problem.goal)
@@ -173,6 +180,7 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
         + costs.overshoot * jnp.mean(over)
         + costs.smoothness * jnp.sum(changes)
         + costs.backwards * jnp.mean(against)
+        + costs.standing * jnp.mean((1.0 - arrived) * stands)
     )
 
 
@@ -239,6 +247,16 @@ def costs_of(
     return jnp.where(jnp.isfinite(found), found, jnp.inf)
 
 
+def now(problem: Problem, predicted: Motion, seen: Array) -> Motion:
+    """The predicted motion with the pose and velocities `seen` (`SEEN`). Wheels keep their slip."""
+    tires, wheels = problem.car.tires, predicted.wheels
+    moved = predicted._replace(**dict(zip(SEEN, seen, strict=True)))
+    faster = moved.vx - predicted.vx
+    front, rear = faster / tires.front.radius, faster / tires.rear.radius
+    fast = (front, front, rear, rear)
+    return moved._replace(wheels=jax.tree.map(jnp.add, wheels, Wheels(*fast)))
+
+
 def weighed(
     mesh: Mesh, samples: int, problem: Problem, memory: Memory, motion: Motion
 ) -> tuple[Array, Scalar, Command, Array, Array]:
@@ -253,9 +271,10 @@ def weighed(
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def decide(
-    mesh: Mesh, samples: int, problem: Problem, memory: Memory, motion: Motion
+    mesh: Mesh, samples: int, problem: Problem, memory: Memory, seen: Array
 ) -> tuple[Command, Memory]:
     """The command of the next knot, and the memory after it."""
+    motion = now(problem, memory.motion, seen)
     key, place, drawn, _, weights = weighed(mesh, samples, problem, memory, motion)
     plan = jax.tree.map(lambda lines: weights @ lines, drawn)
     command = jax.tree.map(lambda line: line[0], plan)
@@ -269,9 +288,10 @@ def decide(
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def look(
-    mesh: Mesh, samples: int, count: int, problem: Problem, memory: Memory, motion: Motion
+    mesh: Mesh, samples: int, count: int, problem: Problem, memory: Memory, seen: Array
 ) -> Rollouts:
     """The first `count` sequences of a decision, and its plan, driven on the plant."""
+    motion = now(problem, memory.motion, seen)
     _, _, drawn, found, weights = weighed(mesh, samples, problem, memory, motion)
     plan = jax.tree.map(lambda lines: weights @ lines, drawn)
 
@@ -319,7 +339,6 @@ class Mppi:
         self._samples = math.ceil(samples / self._mesh.size) * self._mesh.size
         problem, self._place = problem_of(course, car, laps, costs, search)
         self._start = course.start
-        self._radii = [float(t.radius) for t in (car.tires.front, car.tires.rear)]
         self._problem = self._put(problem)
 
     def _put(self, tree: Any) -> Any:
@@ -338,28 +357,20 @@ class Mppi:
     def act(self, memory: Memory, observation: Observation) -> tuple[Command, Memory]:
         """One decision."""
         with jax.enable_x64(False):
-            motion = self._now(memory.motion, observation)
-            command, memory = decide(self._mesh, self._samples, self._problem, memory, motion)
+            seen = _seen(observation)
+            command, memory = decide(self._mesh, self._samples, self._problem, memory, seen)
         return Command(float(command.throttle), float(command.steering)), memory
 
     def rollouts(self, memory: Memory, observation: Observation, count: int) -> Rollouts:
         """The first `count` sequences that `act` draws for the same arguments."""
         with jax.enable_x64(False):
-            motion = self._now(memory.motion, observation)
-            seen = look(self._mesh, self._samples, count, self._problem, memory, motion)
-        found: Rollouts = jax.tree.map(np.asarray, seen)
+            looked = look(
+                self._mesh, self._samples, count, self._problem, memory, _seen(observation)
+            )
+        found: Rollouts = jax.tree.map(np.asarray, looked)
         return found
 
-    def _now(self, predicted: Motion, observation: Observation) -> Motion:
-        """The prediction with the estimate's pose and velocities. Wheels keep their slip."""
-        estimate = observation.estimate
-        seen = {name: float(getattr(estimate, name)) for name in SEEN}
-        faster = seen["vx"] - float(predicted.vx)
-        wheels = Wheels(
-            *(
-                float(speed) + faster / radius
-                for speed, radius in zip(predicted.wheels, np.repeat(self._radii, 2), strict=True)
-            )
-        )
-        moved: Motion = self._put(predicted._replace(wheels=wheels, **seen))
-        return moved
+
+def _seen(observation: Observation) -> np.ndarray:
+    """What the estimate says of the motion (`SEEN`), in one array: it is placed on all cores."""
+    return np.array([getattr(observation.estimate, name) for name in SEEN], np.float32)
