@@ -101,8 +101,9 @@ class Rollouts(NamedTuple):
 
 MOST_SLIP = 9.0  # of that square
 ASTRAY = 0.2  # cosine of the heading off the line, under which a car faces backwards
-SLOW = 0.5  # m/s; a slower car stands
-BACKING = 1.0  # m/s
+# In m/s, of the speed and 0.1:
+SLOW = 0.5  # a slower car stands
+BACKING = 1.0  # a slower car that goes backwards backs off
 HISTORY = 16  # knots; a longer pure delay is cut off
 # Throttle, and steering as a part of the lock.
 HELD = tuple((throttle, side) for throttle in (-1.0, -0.5, 0.5, 1.0) for side in (-1.0, 0.0, 1.0))
@@ -151,7 +152,7 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
 
     bend = way.bend[row]
     speed = jnp.sqrt(motion.vx**2 + motion.vy**2) + 0.1
-    # A slow car that goes backwards backs off: that is no spin.
+    # To back off is no spin.
     forward = jnp.where(speed < BACKING, jnp.abs(motion.vx), motion.vx)
     # Nose in, by `drift`, in a corner; straight elsewhere.
     off = (jnp.arctan2(motion.vy, forward) + bend * costs.drift) / costs.drift
@@ -166,7 +167,8 @@ def cost(problem: Problem, place: Scalar, motion: Motion, commands: Command) -> 
     beyond = jnp.arctan2(out_x * sine - out_y * cosine, out_x * cosine + out_y * sine)
     over = jnp.maximum(bend * beyond, 0.0) ** 2
     against = jnp.maximum(ASTRAY - facing, 0.0)
-    # Nose to a wall, a car has to back off. That loses way for longer than the horizon.
+    # A car with its nose to a wall has to back off. Within the horizon that only loses way, so to
+    # stand has to cost more.
     stands = jnp.maximum(1.0 - speed / SLOW, 0.0)
     changes = jnp.diff(commands.throttle) ** 2 + (jnp.diff(commands.steering) / problem.lock) ** 2
     arrived = jnp.where(places > problem.goal, 1.0, 0.0)
