@@ -101,10 +101,16 @@ TURN = "({ ...document.getElementById('last-turn').dataset })"
 
 
 def until(page: Any, holds: str, seconds: float = 60) -> None:
-    """Wait until a JavaScript expression holds. The page forbids Playwright's own way."""
+    """Wait until a JavaScript expression holds. The page forbids Playwright's own way.
+
+    What cannot be evaluated does not hold yet: a page that loads has not all its parts.
+    """
+    asked = (
+        f"(() => {{ try {{ return Boolean({holds}) }} catch (error) {{ return `${{error}}` }} }})()"
+    )
     end = time.monotonic() + seconds
-    while not page.evaluate(f"Boolean({holds})"):
-        assert time.monotonic() < end, f"{holds}: {page.evaluate(SEEN)}"
+    while (answer := page.evaluate(asked)) is not True:
+        assert time.monotonic() < end, f"{holds}: {answer}, {page.evaluate(SEEN)}"
         page.wait_for_timeout(20)
 
 
@@ -236,6 +242,7 @@ def test_a_player_drifts_round_a_corner_and_keeps_a_run_that_is_marked_and_repla
     assert {-1, 0} <= set(inputs["steer"])  # the key to the right, and none
     with page.context.expect_page() as replay:
         page.locator(f"[data-run='{name}']").get_by_text("Replay").click()
+    replay.value.wait_for_load_state()
     assert name in replay.value.url
     until(replay.value, "document.querySelector('h1').textContent.startsWith('box, person')")
     until(replay.value, "document.getElementById('stage').width > 300")  # it is drawn
