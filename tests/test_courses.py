@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import jax
 import numpy as np
 import pytest
 import tomli_w
@@ -20,6 +21,7 @@ from countersteer.car.files import load_car
 from countersteer.course.course import Course, from_segments, progress
 from countersteer.course.files import course_of_run, course_tables, load_course
 from countersteer.course.position import line_of
+from countersteer.course.way import SPACING, way_of
 from countersteer.errors import InputError
 
 HEADER = "# x_m, y_m, w_tr_right_m, w_tr_left_m\n"
@@ -596,3 +598,12 @@ def test_a_car_that_cuts_a_sharp_corner_does_not_lose_its_place(angle):
     for x, y in zip(xs, ys, strict=True):
         place = float(line.follow(x, y, place).distance)
     assert place == pytest.approx(11.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["box", "ess"])
+def test_the_row_of_a_place_is_that_of_whole_numbers_many_laps_on_and_back(name):
+    way = way_of(load_course(name))
+    places = np.float32(np.arange(-40_000, 40_000) * SPACING)
+    index = np.round(places / np.float32(SPACING)).astype(int)
+    wanted = index % int(way.whole) if way.whole else np.clip(index, 0, int(way.last))
+    np.testing.assert_array_equal(jax.vmap(way.row)(places), wanted)

@@ -204,6 +204,19 @@ def test_the_vector_environment_steps_begins_again_and_repeats():
     assert np.any(made.reset(seed=10)[0] != first)
 
 
+@pytest.mark.parametrize("cores", [1, 3])
+def test_the_number_of_threads_changes_no_car(cores):
+    command = np.random.default_rng(2).uniform(-1, 1, (12, 2)).astype(np.float32)
+    found = []
+    for one in (cores, 2):
+        made = DriftVectorEnv(12, cores=one)
+        made.reset(seed=9)
+        found.append([made.step(command) for _ in range(5)][-1][:2])
+        made.close()
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+
+
 def test_a_start_in_motion_is_on_the_course_and_rolls():
     course, car = load_course("box"), load_car("rx7")
     own, slots = owns(CARS, car, course, range(64))

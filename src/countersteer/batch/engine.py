@@ -120,17 +120,17 @@ def in_one_program(
     return _compiled(on_core, cores)
 
 
-def on_blocks(run: Callable[..., Any], cores: int | None = None) -> Callable[..., Any]:
-    """`run(own, *shared)` for each block, in one program too.
+def on_blocks(run: Callable[..., Any]) -> Callable[..., Any]:
+    """`run(own, *shared)` for each block, in one program, on the core that calls it.
 
-    `own` and the result have a leading axis of blocks, their number a multiple of cores. The loop
-    is fast where they are few arrays: see `packed`.
+    `own` and the result have a leading axis of blocks. The loop is fast where they are few arrays:
+    see `packed`.
     """
 
     def on_core(own: Any, *shared: Any) -> Any:
         return jax.lax.map(lambda one: run(one, *shared), own)
 
-    return _compiled(on_core, cores)
+    return jax.jit(on_core)
 
 
 def _compiled(on_core: Callable[..., Any], cores: int | None) -> Callable[..., Any]:

@@ -36,9 +36,12 @@ class Way(NamedTuple):
 
     def row(self, place: Scalar) -> Scalar:
         """The row of a place (m along the line from its first point)."""
-        index = jnp.round(place / SPACING).astype(jnp.int32)
-        wrapped = jnp.where(self.whole > 0, index % jnp.maximum(self.whole, 1), index)
-        return jnp.clip(wrapped, 0, self.last)
+        index = jnp.round(place / SPACING)
+        # Whole numbers of this size are exact as fractions, and need no division of integers, which
+        # vector units lack.
+        whole = jnp.asarray(self.whole, index.dtype)
+        laps = jnp.where(whole > 0, jnp.floor(index / jnp.maximum(whole, 1)), 0)
+        return jnp.clip(index - laps * whole, 0, self.last).astype(jnp.int32)
 
     def point(self, place: Scalar) -> tuple[Scalar, Scalar]:
         """The point at a place (m): that of its row, moved on along the line."""

@@ -1,4 +1,7 @@
-"""The Gymnasium vector environment: thousands of cars, stepped on all cores in one program.
+"""The Gymnasium vector environment: thousands of cars, stepped on all cores.
+
+Each core has a thread and its share of the cars, and runs the same program for them. A thread gives
+its part of the results their form too, so no core waits while another does.
 
 Each sub-environment has a car of its own, drawn at `reset`, and keeps it. Autoreset is
 `NEXT_STEP`: the step after an episode's end begins a new one, ignores the action, and returns a
@@ -8,6 +11,7 @@ reward of 0. `terminated` is the judge's end; `truncated` the limit of time.
 import functools
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -49,10 +53,11 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         cores: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        """Raises `InputError` for a wrong name. `cores` is 1, or the number JAX has devices for."""
+        """Raises `InputError` for a wrong name. `cores` is the number of threads, one for each."""
         if render_mode is not None:
             raise ValueError("a vector environment is not rendered: make one of its cars alone")
-        configure_jax(blocks=True, cores=os.cpu_count() or 1)
+        cores = cores or os.cpu_count() or 1
+        configure_jax(blocks=True, cores=cores)
         self.num_envs, self.longest = num_envs, longest
         self.course, self.car = load_course(course), load_car(car)
         self.course.check_laps(laps)
@@ -61,11 +66,13 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        cores = cores or len(jax.devices())
         block = min(engine.CACHED_LANES, max(1, num_envs // cores))
         # Whole blocks on each core: the lanes beyond the wanted ones are driven and not shown.
         self._lanes = engine.whole_blocks(num_envs, block, cores)
-        self._block, self._cores = block, cores
+        self._block = block
+        each = self._lanes // block // cores
+        self._shares = [slice(i * each, (i + 1) * each) for i in range(cores)]  # of the blocks
+        self._threads = ThreadPoolExecutor(cores)
         self._form: Any = None  # of what a step is compiled for
         self._reset = jax.jit(jax.vmap(Environment.reset, (None, 0, 0, None)))
         self._pack = jax.jit(jax.vmap(engine.packed))
@@ -91,18 +98,21 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         nothing: Any = ()
         apart, once = engine.parted(own)
         same = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (self._environment, once))
-        self._same = engine.on_each(engine.packed(same), self._cores)
+        self._same = engine.packed(same)
         parts = [
             engine.in_blocks(tree, self._block) for tree in (apart, state._replace(own=nothing))
         ]
-        self._own, self._state = engine.shared_out(tuple(map(self._pack, parts)), self._cores)
+        self._own, self._state = (
+            [jax.tree.map(lambda leaf, of=of: leaf[of], packed) for of in self._shares]
+            for packed in map(self._pack, parts)
+        )
         form = slots, jax.tree.structure(apart)
         if form != self._form:
             own_of, lane_of = (
                 engine.unpacking(jax.tree.map(lambda leaf: leaf[0], part)) for part in parts
             )
             stepped = functools.partial(_step, own_of, lane_of, engine.unpacking(same))
-            self._step = engine.on_blocks(stepped, self._cores)
+            self._step = engine.on_blocks(stepped)
             self._form = form
         self._done = np.zeros(self._lanes, np.float32)
         return np.asarray(seen)[: self.num_envs], {}
@@ -113,22 +123,38 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         """One decision of 20 ms of all cars; `infos` has the reward's terms and the outcomes."""
         asked = np.zeros((self._lanes, 3), np.float32)
         asked[: self.num_envs, :2], asked[:, 2] = actions, self._done
-        own = (self._own, self._state, engine.in_blocks(asked, self._block))
-        self._state, told = self._step(own, self._same, np.int32(self._tick))
+        asked = engine.in_blocks(asked, self._block)
+        seen = np.empty((*asked.shape[:2], FEATURES), np.float32)
+        told = np.empty((TOLD, *asked.shape[:2]), np.float32)
+
+        def drive(core: int) -> None:
+            share = self._shares[core]
+            block = (self._own[core], self._state[core], asked[share])
+            self._state[core], found = self._step(block, self._same, np.int32(self._tick))
+            found = np.asarray(found)
+            seen[share] = found[:, :FEATURES].transpose(0, 2, 1)
+            told[:, share] = found[:, FEATURES:].transpose(1, 0, 2)
+
+        list(self._threads.map(drive, range(len(self._shares))))
         self._tick += self._environment.ticks
-        told = np.asarray(told).reshape(self._lanes, -1)
-        seen, terms, ended, time, outcome = np.split(told, PARTS, axis=1)
-        over = ended[:, 0] > 0
-        late = (time[:, 0] >= self.longest - 1e-4) & ~over
+        *terms, ended, time, outcome = told.reshape(TOLD, self._lanes)
+        over = ended > 0
+        late = (time >= self.longest - 1e-4) & ~over
         self._done = (late | over).astype(np.float32)
         n = self.num_envs
-        infos = {name: terms[:n, i] for i, name in enumerate(Reward._fields)}
-        infos["outcome"] = outcome[:n, 0].astype(np.int32)
-        return seen[:n], terms[:n].sum(axis=1), over[:n], late[:n], infos
+        infos = {name: one[:n] for name, one in zip(Reward._fields, terms, strict=True)}
+        infos["outcome"] = outcome[:n].astype(np.int32)
+        seen = seen.reshape(self._lanes, FEATURES)[:n]
+        return seen, np.sum(terms, axis=0)[:n], over[:n], late[:n], infos
+
+    def close_extras(self, **_: Any) -> None:
+        """End the threads."""
+        self._threads.shutdown()
 
 
-# Columns of what a step tells: observation, the reward's terms, end, s of the episode, outcome.
-PARTS = np.cumsum([FEATURES, len(Reward._fields), 1, 1])
+# What a step tells of a car beside its observation: the reward's terms, end, s of the episode,
+# outcome.
+TOLD = len(Reward._fields) + 3
 
 
 def _step(
@@ -142,8 +168,8 @@ def _step(
     """A block's decision. Lanes that had ended begin a new episode instead.
 
     A lane is asked for its action, and has a 1 behind it if it had ended. `same` is the
-    environment, and what all cars have alike. Returns the packed lanes, and what is told of each
-    (`PARTS`).
+    environment, and what all cars have alike. Returns the packed lanes, and what is told of each:
+    its observation and `TOLD` more, in rows.
     """
     none: Any = ()  # what a car is does not change
     environment, once = jax.tree.map(lambda leaf: leaf[0], same_of(same))
@@ -160,5 +186,5 @@ def _step(
         return after._replace(own=none), told
 
     own, state, asked = block
-    lanes, told = jax.vmap(one)(own_of(own), lane_of(state), asked)
+    lanes, told = jax.vmap(one, out_axes=(0, 1))(own_of(own), lane_of(state), asked)
     return engine.packed(lanes), told
