@@ -46,8 +46,8 @@ def add(verbs: Verbs) -> None:
     ppo.add_argument("course", metavar="COURSE", help="as for drive")
     ppo.option("--car", None, str, "rx7", "the nominal one")
     ppo.option("--cars", "SET", str, "around", "as for evaluate")
-    meaning = "millions of decisions of 20 ms to learn from; some 3 a minute or more on two cores"
-    ppo.option("--samples", "M", number(0.1, 10_000), 45.0, meaning)
+    meaning = "millions of decisions of 20 ms to learn from; 3 to 6 a minute on two cores"
+    ppo.option("--samples", "M", number(0.1, 10_000), 70.0, meaning)
     meaning = "how a term of the reward counts, such as 'sideslip=5' (repeatable)"
     ppo.option("--reward", "TERM=WEIGHT", str, [], meaning, action="append")
     ppo.seed()
