@@ -56,8 +56,9 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         """Raises `InputError` for a wrong name. `cores` is the number of threads, one for each."""
         if render_mode is not None:
             raise ValueError("a vector environment is not rendered: make one of its cars alone")
-        cores = cores or os.cpu_count() or 1
-        configure_jax(blocks=True, cores=cores)
+        all_cores = os.cpu_count() or 1
+        configure_jax(blocks=True, cores=all_cores)
+        cores = cores or all_cores
         self.num_envs, self.longest = num_envs, longest
         self.course, self.car = load_course(course), load_car(car)
         self.course.check_laps(laps)
