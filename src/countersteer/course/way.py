@@ -37,8 +37,7 @@ class Way(NamedTuple):
     def row(self, place: Scalar) -> Scalar:
         """The row of a place (m along the line from its first point)."""
         index = jnp.round(place / SPACING)
-        # Whole numbers of this size are exact as fractions, and need no division of integers, which
-        # vector units lack.
+        # Vector units cannot divide integers. Floating-point numbers of this size are as exact.
         whole = jnp.asarray(self.whole, index.dtype)
         laps = jnp.where(whole > 0, jnp.floor(index / jnp.maximum(whole, 1)), 0)
         return jnp.clip(index - laps * whole, 0, self.last).astype(jnp.int32)

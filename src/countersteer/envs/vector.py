@@ -1,7 +1,7 @@
 """The Gymnasium vector environment: thousands of cars, stepped on all cores.
 
-Each core has a thread and its share of the cars, and runs the same program for them. A thread gives
-its part of the results their form too, so no core waits while another does.
+Each core has a thread, which runs the same program for its share of the cars and lays out what they
+tell as Gymnasium has it.
 
 Each sub-environment has a car of its own, drawn at `reset`, and keeps it. Autoreset is
 `NEXT_STEP`: the step after an episode's end begins a new one, ignores the action, and returns a
@@ -53,7 +53,7 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         cores: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        """Raises `InputError` for a wrong name. `cores` is the number of threads, one for each."""
+        """Raises `InputError` for a wrong name. `cores` are all by default."""
         if render_mode is not None:
             raise ValueError("a vector environment is not rendered: make one of its cars alone")
         all_cores = os.cpu_count() or 1
@@ -136,6 +136,7 @@ class DriftVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
             seen[share] = found[:, :FEATURES].transpose(0, 2, 1)
             told[:, share] = found[:, FEATURES:].transpose(1, 0, 2)
 
+        # As a list, it waits for all, and raises what was raised in a thread.
         list(self._threads.map(drive, range(len(self._shares))))
         self._tick += self._environment.ticks
         *terms, ended, time, outcome = told.reshape(TOLD, self._lanes)
